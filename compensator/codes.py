@@ -71,6 +71,10 @@ class Remark(str):
     def __reduce__(self) -> tuple[Callable[[Code, str], Remark], tuple[Code, str]]:
         return _restored, (self.code, str(self))
 
+    def worded(self, words: str) -> Remark:
+        """Return the remark in other words, with the same code."""
+        return _restored(self.code, words)
+
     @property
     def marked(self) -> str:
         """The remark followed by its code, for a terminal or a log."""

@@ -6,24 +6,28 @@ import csv
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compensator.api.files import ModelLike, Paged, model_of
+from compensator.api.axis_results import PagedAxes
+from compensator.api.files import ModelLike, Paged, models_of
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
+from compensator.axes import AxisWords
 from compensator.blas import one_thread
+from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
 from compensator.data.frames import frame_of
-from compensator.data.measurement import DataLike, check_each_once, measurements, runs_in
+from compensator.data.measurement import DataLike, Measurement, check_each_once, measurements, runs_in
 from compensator.data.screening import check_deformation_scale, screen_temperatures
 from compensator.display import Table
-from compensator.errors import DataError, UsageError
+from compensator.errors import DataError, ModelError, UsageError
 from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
 from compensator.model.simulation import Scores, csv_rows
+from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -52,6 +56,8 @@ class ComparisonResult(Paged):
         Names of the files or tables.
     in_frame : bool
         Whether tables are DataFrames.
+    words : AxisWords
+        Names of columns and texts of the axis.
     """
 
     scores: dict[str, Scores]
@@ -62,6 +68,7 @@ class ComparisonResult(Paged):
     samples: int
     data: tuple[str, ...] = ()
     in_frame: bool = False
+    words: AxisWords = field(default_factory=AxisWords)
 
     @property
     def predictions(self) -> dict[str, Vector]:
@@ -88,7 +95,7 @@ class ComparisonResult(Paged):
 
     def contents(self) -> list[str | Table]:
         """Return the content: the verdict, the number of samples, and the errors of each model."""
-        return [self._verdict(), table_of_scores([self.scores])]
+        return [self._verdict(), self.words(table_of_scores([self.scores]))]
 
     def _verdict(self) -> str:
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
@@ -106,12 +113,18 @@ class ComparisonResult(Paged):
         OSError
             If the file cannot be written.
         """
-        columns = {"t_s": self.t_h * 3600.0, "y_um": self.y_um}
-        for name, values in self.predictions.items():
-            columns |= {f"y_pred_um {name}": values, f"residual_um {name}": self.residuals[name]}
         with atomic_write(Path(path)) as file:
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.columns))
         return Path(path)
+
+    @property
+    def columns(self) -> dict[str, Vector]:
+        """Time, measured Y, and each prediction and residual, by the names that `save` writes."""
+        columns = {"t_s": self.t_h * 3600.0, self.words("y_um"): self.y_um}
+        for name, values in self.predictions.items():
+            columns[f"{self.words('y_pred_um')} {name}"] = values
+            columns[f"{self.words('residual_um')} {name}"] = self.residuals[name]
+        return columns
 
     def as_page(self) -> Page:
         """Return the content of the page."""
@@ -134,7 +147,7 @@ class ComparisonResult(Paged):
         figure = Figure(
             title="Measured and predicted deformation in free run, and the residuals",
             x_label="time, h",
-            y_label="Y, µm",
+            y_label=self.words("Y, µm"),
             lines=tuple(lines),
             below=(residuals,),
             note="Above measured and predicted deformation, below measured − predicted.",
@@ -156,7 +169,19 @@ class ComparisonResult(Paged):
         curves = [("measured", self.t_h, self.y_um)]
         curves += [(name, self.t_h, values) for name, values in self.predictions.items()]
         residuals = [(name, self.t_h, values) for name, values in self.residuals.items()]
-        return stacked([("Y, µm", curves), ("measured − predicted, µm", residuals)])[0]
+        return stacked([(self.words("Y, µm"), curves), ("measured − predicted, µm", residuals)])[0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class ComparedAxes(PagedAxes[ComparisonResult]):
+    """Comparisons of models of several axes, by axis."""
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns of all axes as one CSV."""
+        columns = {name: values for result in self.results.values() for name, values in result.columns.items()}
+        with atomic_write(Path(path)) as file:
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
+        return Path(path)
 
 
 def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -165,8 +190,13 @@ def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
 
 @one_thread
 def compare(
-    models: Mapping[str, ModelLike], data: DataLike, *, columns: Mapping[str, str] | None = None, from_h: float = 0.0
-) -> ComparisonResult:
+    models: Mapping[str, ModelLike],
+    data: DataLike,
+    *,
+    columns: Mapping[str, str] | None = None,
+    axis: AxisLike = None,
+    from_h: float = 0.0,
+) -> ComparisonResult | ComparedAxes:
     """Compare models in free run on the samples that all of them predict.
 
     Parameters
@@ -177,13 +207,15 @@ def compare(
         Data with T_Q, AT and measured Y.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    axis : str or sequence of str, optional
+        Axes to compare; by default all that every model and the data have.
     from_h : float
         Compare from this hour of each file on; the models run from its start.
 
     Returns
     -------
     ComparisonResult
-        Errors of each model, of no compensation, and of persistence.
+        Errors of each model, of no compensation, and of persistence. Of several axes: one for each, in a ComparedAxes.
 
     Raises
     ------
@@ -192,15 +224,45 @@ def compare(
     """
     if not isinstance(models, Mapping):
         raise UsageError(f'compare: {type(models).__name__}, expected a dict: {{"first": model, "second": other}}')
-    found = {str(name): model_of(model) for name, model in models.items()}
+    found = {str(name): models_of(model, axis) for name, model in models.items()}
     if taken := found.keys() & {NOTHING, PERSISTENCE}:
         raise UsageError(f"compare: {taken.pop()!r} is a row of its own, expected another name for the model")
-    periods = {model.period_s for model in found.values()}
+    periods = {model.period_s for several in found.values() for model in several.values()}
     if len(periods) != 1:
         raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
     measured = measurements(data, "data", columns, needed=True)
     check_each_once(measured)
-    [period_s] = periods
+    results = {}
+    for name in _common_axes(list(found.values()), measured, axis):
+        words = words_of(name, measured)
+        with words.errors():
+            own = {model: several[name] for model, several in found.items()}
+            results[name] = _compare(own, of_axis(measured, name), from_h, words)
+    if len(results) > 1:
+        return ComparedAxes(results=results)
+    [result] = results.values()
+    return result
+
+
+def _common_axes(
+    models: Sequence[Mapping[str, ThermalModel]], measured: Sequence[Measurement], axis: AxisLike
+) -> list[str]:
+    """Return the axes that all models have; without a choice, those of them that the data have."""
+    common = [name for name in models[0] if all(name in several for several in models)]
+    if not common:
+        raise ModelError(
+            f"compare: models of {' and of '.join(', '.join(several) for several in models)}, no common axis"
+        )
+    if len(common) == 1 or axis is not None:
+        return list(axes_in(measured, common))
+    return [name for name in axes_in(measured) if name in common] or common[:1]
+
+
+def _compare(
+    found: Mapping[str, ThermalModel], measured: Sequence[Measurement], from_h: float, words: AxisWords
+) -> ComparisonResult:
+    """Compare the models of one axis on its data."""
+    period_s = next(iter(found.values())).period_s
     for one in measured:
         screened, _ = runs_in([one], period_s)
         screen_temperatures(one.label, screened, quiet_air=True)
@@ -218,4 +280,5 @@ def compare(
         samples=runs.samples,
         data=tuple(origin.name for one in measured for origin in one.origins),
         in_frame=any(one.in_frame for one in measured),
+        words=words,
     )

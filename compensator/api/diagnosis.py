@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +16,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator import __version__
-from compensator.api.files import ModelLike, Paged, as_in_file, model_of
+from compensator.api.axis_results import PagedAxes
+from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write, require_folder
+from compensator.axes import AxisWords, column_of, label_of
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
+from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
 from compensator.data.measurement import DataLike, Measurement, check_each_once, check_validation, measurements, runs_in
 from compensator.data.screening import check_deformation_scale, require_y_noise, screen_temperatures
+from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
@@ -30,11 +35,13 @@ from compensator.diagnose.series import series_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError
+from compensator.identify.pairs import pairs
+from compensator.model.effects.hypothesis import Place
 from compensator.model.free_run import FreeRunErrors
-from compensator.model.model_writer import write_model
+from compensator.model.model_writer import write_axes, write_model
 from compensator.model.simulation import csv_rows, require_channels
 from compensator.model.thermal_model import ThermalModel
-from compensator.progress import Progress, unreported
+from compensator.progress import ExecutorMap, Progress, unreported
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -58,17 +65,25 @@ class DiagnosisResult(Paged):
         Remarks on the data.
     free_run : tuple of FreeRunErrors
         Errors of both models in free run as the service runs, on each of the data.
+    words : AxisWords
+        Names of columns and texts of the axis.
     """
 
     model: ThermalModel
     diagnosis: Diagnosis
     remarks: tuple[Remark, ...] = ()
     free_run: tuple[FreeRunErrors, ...] = ()
+    words: AxisWords = field(default_factory=AxisWords)
 
     @property
     def verdict(self) -> str:
         """`adequate`, `explained`, `partly_explained`, or `unexplained`."""
         return self.diagnosis.verdict
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the model file."""
+        return self.model.sha256
 
     @property
     def effects(self) -> tuple[FoundEffect, ...]:
@@ -77,11 +92,11 @@ class DiagnosisResult(Paged):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`."""
-        return figures(self.diagnosis, self.free_run)
+        return self.words(figures(self.diagnosis, self.free_run))
 
     def contents(self) -> list[str | Table | Words | Listing]:
         """Return the content: verdict, errors, effects with their parameters, warnings."""
-        return list(contents(self.diagnosis, self.remarks, self.free_run))
+        return self.words(list(contents(self.diagnosis, self.remarks, self.free_run)))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
@@ -113,14 +128,19 @@ class DiagnosisResult(Paged):
         found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         self.write_page(page, also=also)
         if series:
-            with atomic_write(curves) as file:
-                csv.writer(file, lineterminator="\n").writerows(csv_rows(series_of(self.diagnosis)))
+            self.write_series(curves)
+
+    def write_series(self, path: Path) -> None:
+        """Write all curves as CSV."""
+        with atomic_write(path) as file:
+            columns = self.words.table(series_of(self.diagnosis))
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
 
     def as_page(self) -> Page:
         """Return the content of the page."""
         from compensator.report.diagnosis import page_of
 
-        return page_of(self.diagnosis, self.model, self.remarks, self.free_run)
+        return self.words(page_of(self.diagnosis, self.model, self.remarks, self.free_run))
 
     def plot(self) -> Plot:
         """Plot the residual before and after on held-out data, one run after another."""
@@ -132,19 +152,127 @@ class DiagnosisResult(Paged):
         return stacked([("residual on held-out blocks, µm", [before, after])])[0]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class DiagnosedAxes(PagedAxes[DiagnosisResult]):
+    """What the models of several axes lack.
+
+    Parameters
+    ----------
+    results : dict of str to DiagnosisResult
+        Each axis.
+    machine : tuple of MachineEffect
+        Every effect with what it moves on each axis, the largest first.
+    """
+
+    results: Mapping[str, DiagnosisResult]
+    machine: tuple[MachineEffect, ...] = ()
+
+    @property
+    def model(self) -> dict[str, ThermalModel]:
+        """The extended model of each axis, as read back from their file."""
+        return {axis: result.model for axis, result in self.results.items()}
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the model file."""
+        return next(iter(self.results.values())).sha256
+
+    @property
+    def verdict(self) -> str:
+        """The verdict of the axis that lacks most."""
+        order = ("adequate", "explained", "partly_explained", "unexplained")
+        return max((result.verdict for result in self.results.values()), key=order.index)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis."""
+        axes = {axis: result.to_dict() for axis, result in self.results.items()}
+        listed = {
+            key: [{"axis": axis, **one} for axis, found in axes.items() for one in found[key]]
+            for key in ("effects", "rivals")
+        }
+        machine = [
+            {
+                "kind": one.place[0],
+                "path": one.place[1] or None,
+                "channel": one.place[2] or None,
+                "axes": [dataclasses.asdict(share) | {"seen": share.is_seen} for share in one.shares],
+                "suspect_probe": one.suspect or None,
+                "sentence": one.sentence,
+            }
+            for one in self.machine
+        ]
+        return {"verdict": self.verdict, **listed, "machine": machine, "axes": axes}
+
+    def sentences(self) -> list[str]:
+        """Return what is said of the machine: each effect with its axes, and the verdict of each axis."""
+        alike: dict[str, list[str]] = {}
+        for axis, result in self.results.items():
+            alike.setdefault(result.verdict.replace("_", " "), []).append(label_of(axis))
+        return [*(one.sentence for one in self.machine), *(f"{', '.join(a)}: {word}." for word, a in alike.items())]
+
+    def contents(self) -> Sequence[str | Table | Words | Listing]:
+        """Return the content: what is said of the machine, a column for each axis, and the content of each axis."""
+        parts: list[str | Table | Words | Listing] = [" ".join(self.sentences())]
+        parts += [self.table()] if self.machine else []
+        for axis, result in self.results.items():
+            parts += [f"Axis {label_of(axis)}", *result.contents()]
+        return parts
+
+    def table(self) -> Table:
+        """Return what each effect moves, with a column for each axis."""
+        rows = []
+        for one in self.machine:
+            shares = {share.axis: share for share in one.shares}
+            cells = (f"{shares[axis].moves_um:.1f} ± {shares[axis].std_um:.1f}" for axis in self.results)
+            rows.append([" ".join(filter(None, one.place)), *cells])
+        head = ["effect", *map(label_of, self.results)]
+        note = "The same form on every axis, its size fitted; negative: against its channel."
+        return Table(title="What each effect moves, µm peak to peak", head=head, rows=rows, note=note)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the extended model of all axes to a file, or everything to a folder; as `DiagnosisResult.save`."""
+        target = Path(path)
+        if target.suffix.lower() == ".toml":
+            write_axes(target, self.model)
+        else:
+            require_folder(target)
+            self.save_all(target, series=True)
+        return target
+
+    def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
+        """Write as `DiagnosisResult.save_all`; the curves of each axis into a file of its own, `series-z.csv`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        model, found, page, curves = (folder / name for name in FILES)
+        write_axes(model, self.model)
+        found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        self.write_page(page, also=also)
+        for axis, result in self.results.items() if series else ():
+            result.write_series(curves.with_stem(f"{curves.stem}-{axis}"))
+
+    def as_page(self) -> Page:
+        """Return the page: what is said of the machine, a column for each axis, and a section for each."""
+        from compensator.report.axes import page_of_axes
+
+        pages = {axis: result.as_page() for axis, result in self.results.items()}
+        return page_of_axes(pages, " ".join(self.sentences()), [self.table()] if self.machine else [])
+
+
 @one_thread
 def diagnose(
     model: ModelLike,
     data: DataLike,
     *,
     columns: Mapping[str, str] | None = None,
+    axis: AxisLike = None,
     y_std_um: float | None = None,
     fit_until_h: float | None = None,
     validate: DataLike = (),
     progress: Progress = unreported,
     executor: Executor | None = None,
-) -> DiagnosisResult:
+) -> DiagnosisResult | DiagnosedAxes:
     """Find what a model lacks.
+
+    An effect that one axis shows is looked for on the others.
 
     Parameters
     ----------
@@ -154,6 +282,8 @@ def diagnose(
         Measured Y with every channel that was logged.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    axis : str or sequence of str, optional
+        Axes to diagnose; by default all that the model and the data have.
     y_std_um : float, optional
         Standard deviation of one measured Y, µm. Needed where Y was measured now and then, as by a touch probe;
         elsewhere neighbouring values show it.
@@ -169,14 +299,14 @@ def diagnose(
     Returns
     -------
     DiagnosisResult
-        Verdict, effects, extended model.
+        Verdict, effects, extended model. Of several axes: one for each, in a DiagnosedAxes.
 
     Raises
     ------
     CompensatorError
         If model or data cannot be read, or there is too little data.
     """
-    base = model_of(model)
+    bases = models_of(model, axis)
     whole = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)
     check_each_once(whole)
@@ -184,18 +314,65 @@ def diagnose(
     longest = max(one.hours for one in whole)
     if fit_until_h is not None and fit_until_h >= longest:
         raise UsageError(f"fit until {fit_until_h:g} h: the data end after {longest:.3g} h, expected an earlier hour")
-    measured = whole if fit_until_h is None else [one.before(fit_until_h) for one in whole]
-    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um, check=partial(require_channels, base))
-    name = ", ".join(dict.fromkeys(run.name for run in runs))
-    screen_temperatures(name, runs, quiet_air=True)
-    require_y_noise(name, runs)
-    check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
+    if axis is not None or len(bases) == 1:
+        axes = axes_in(whole, list(bases))
+    else:
+        axes = tuple(one for one in bases if one in axes_in(whole, None)) or tuple(bases)[:1]
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:
         assert executor is not None
         return executor.map(partial(in_one_thread, function), *values)
 
-    found = find_effects(base, runs, progress=progress, executor_map=executor_map if executor else map)
+    def diagnosed(one: str, number: int, of: int, expected: frozenset[Place] = frozenset()) -> DiagnosisResult:
+        words = words_of(one, whole, validation)
+        with words.errors():
+            return _diagnosed(
+                bases[one],
+                of_axis(whole, one),
+                of_axis(validation, one),
+                words,
+                fit_until_h=fit_until_h,
+                y_std_um=y_std_um,
+                expected=expected,
+                progress=lambda done, steps: progress(number * steps + done, of * steps),
+                executor_map=executor_map if executor else map,
+            )
+
+    results = {one: diagnosed(one, i, len(axes)) for i, one in enumerate(axes)}
+    if len(results) == 1:
+        return next(iter(results.values()))
+    missing = missing_places({one: result.diagnosis for one, result in results.items()})
+    results |= {one: diagnosed(one, i, len(missing), places) for i, (one, places) in enumerate(missing.items())}
+    models = axes_as_in_file({one: result.model for one, result in results.items()})
+    results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
+    names = [one for one in axes if all(column_of(one) in each.table.columns for each in whole)]
+    records = [record for each in whole for record in each.at_period(bases[axes[0]].period_s).records]
+    values = {one: [record.columns[column_of(one)] for record in records] for one in names}
+    partners = {a: b for pair in pairs(values, bases[axes[0]].period_s) for a, b in pair.both_ways}
+    found = across({one: result.diagnosis for one, result in results.items()}, partners)
+    return DiagnosedAxes(results=results, machine=found)
+
+
+def _diagnosed(
+    base: ThermalModel,
+    whole: Sequence[Measurement],
+    validation: Sequence[Measurement],
+    words: AxisWords,
+    *,
+    fit_until_h: float | None,
+    y_std_um: float | None,
+    expected: frozenset[Place],
+    progress: Progress,
+    executor_map: ExecutorMap,
+) -> DiagnosisResult:
+    """Diagnose the model of an axis on its data."""
+    measured = list(whole) if fit_until_h is None else [one.before(fit_until_h) for one in whole]
+    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um, check=partial(require_channels, base))
+    name = ", ".join(dict.fromkeys(run.name for run in runs))
+    screen_temperatures(name, runs, quiet_air=True)
+    require_y_noise(name, runs)
+    check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
+    found = find_effects(base, runs, expected=expected, progress=progress, executor_map=executor_map)
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
@@ -205,11 +382,11 @@ def diagnose(
     for one in validation:
         absent = [name for name in extended.channels if name not in one.table.columns]
         if absent:
-            words = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
-            remarks.append(Remark(DataRemark.NOT_VALIDATED, words))
+            text = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
+            remarks.append(Remark(DataRemark.NOT_VALIDATED, text))
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
     shown = tuple(one for one in free_run if one.samples)
-    return DiagnosisResult(model=extended, diagnosis=found, remarks=tuple(remarks), free_run=shown)
+    return DiagnosisResult(model=extended, diagnosis=found, remarks=tuple(remarks), free_run=shown, words=words)
 
 
 def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diagnosis) -> dict[str, Any]:

@@ -8,20 +8,24 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from compensator.axes import FIRST
+from compensator.data.axes import AxisLike, asked_axes
 from compensator.display import Shown
-from compensator.errors import UsageError
-from compensator.model.model_file import load_model, parse_model
-from compensator.model.model_writer import dump_model
+from compensator.errors import ModelError, UsageError
+from compensator.model.model_file import load_axes, load_model, parse_axes
+from compensator.model.model_writer import dump_axes
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
 
-ModelLike = ThermalModel | str | os.PathLike[str]
+ModelLike = ThermalModel | Mapping[str, ThermalModel] | str | os.PathLike[str]
 
 
 def model_of(model: ModelLike) -> ThermalModel:
     """Return a model: a model itself, the model of a result, from a file, or the published one by its name.
+
+    Of several axes, that of Y.
 
     Raises
     ------
@@ -33,9 +37,36 @@ def model_of(model: ModelLike) -> ThermalModel:
     own = getattr(model, "model", model)
     if isinstance(own, ThermalModel):
         return own
-    if not isinstance(own, (str, os.PathLike)):
+    if isinstance(own, (str, os.PathLike)):
+        return load_model(Path(own))
+    return models_of(own, FIRST)[FIRST]
+
+
+def models_of(model: ModelLike, axis: AxisLike = None) -> dict[str, ThermalModel]:
+    """Return the models of all axes, or of those asked for, by axis; `model` as for `model_of`.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or an axis that is asked for is missing.
+    UsageError
+        If the argument has another type.
+    """
+    own = getattr(model, "model", model)
+    if isinstance(own, ThermalModel):
+        found = {own.axis: own}
+    elif isinstance(own, (str, os.PathLike)):
+        found = load_axes(Path(own))
+    elif isinstance(own, Mapping) and own and all(isinstance(one, ThermalModel) for one in own.values()):
+        found = dict(own)
+    else:
         raise UsageError(f"model: {type(model).__name__}, expected a model, a result, a path, or the name of a model")
-    return load_model(Path(own))
+    asked = asked_axes(axis)
+    for name in asked:
+        if name not in found:
+            has = ", ".join(found)
+            raise ModelError(f"model {next(iter(found.values())).name}: no axis {name}; it has: {has}")
+    return {name: found[name] for name in asked or found}
 
 
 def as_in_file(model: ThermalModel, provenance: Mapping[str, Any]) -> ThermalModel:
@@ -47,7 +78,18 @@ def as_in_file(model: ThermalModel, provenance: Mapping[str, Any]) -> ThermalMod
         If it cannot be stored in a file.
     """
     whole = dataclasses.replace(model, provenance=dict(model.provenance) | dict(provenance))
-    return parse_model(dump_model(whole).encode("utf-8"), source=model.name)
+    return axes_as_in_file({model.axis: whole})[model.axis]
+
+
+def axes_as_in_file(models: Mapping[str, ThermalModel]) -> dict[str, ThermalModel]:
+    """Return the models of all axes as read back from their file, with the file's hash.
+
+    Raises
+    ------
+    ModelError
+        If they cannot be stored in a file.
+    """
+    return parse_axes(dump_axes(models).encode("utf-8"), source=next(iter(models.values())).name)
 
 
 class Paged(Shown):

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
+import numpy as np
+
 from compensator import __version__
-from compensator.api.files import ModelLike, as_in_file, model_of
+from compensator.api.files import ModelLike, axes_as_in_file, models_of
 from compensator.api.identification_result import IdentificationResult
+from compensator.api.identified_axes import IdentifiedAxes
+from compensator.axes import AxisWords, column_of
 from compensator.blas import one_thread
+from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
 from compensator.data.measurement import (
     PERIOD_S,
     DataLike,
@@ -22,10 +28,12 @@ from compensator.data.measurement import (
 )
 from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.errors import UsageError
-from compensator.identify.calibration import calibrate
+from compensator.identify.calibration import Calibration, calibrate, of_machine
 from compensator.identify.comparison import compare
 from compensator.identify.criticism import criticise
+from compensator.identify.pairs import Pair, pairs
 from compensator.identify.settings import Method, Settings
+from compensator.identify.shared_poles import calibrated_together
 from compensator.identify.summary import MODEL, figures
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.thermal_model import ThermalModel
@@ -43,6 +51,7 @@ def identify(
     validate: DataLike = (),
     etve: DataLike = (),
     columns: Mapping[str, str] | None = None,
+    axis: AxisLike = None,
     name: str = "model",
     kind: Literal["auto", "heat", "direct"] = "auto",
     method: Method = "IV",
@@ -56,8 +65,11 @@ def identify(
     y_std_um: float | None = None,
     reference: ModelLike | None = None,
     progress: Progress = unreported,
-) -> IdentificationResult:
+) -> IdentificationResult | IdentifiedAxes:
     """Identify a thermal model from measured runs.
+
+    Several axes are identified together: the estimation of the heat is the machine's, and so are the time constants
+    where the data do not contradict.
 
     Parameters
     ----------
@@ -67,6 +79,8 @@ def identify(
         Runs used only for validation; runs with the heat source off (methods II and III).
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    axis : str or sequence of str, optional
+        Axes, or single probes by the names of their columns without `_um`; by default all axes that the data have.
     name : str
         Name of the model.
     kind : {"auto", "heat", "direct"}
@@ -98,7 +112,7 @@ def identify(
     Returns
     -------
     IdentificationResult
-        Model, parameters, standard errors, errors in free run.
+        Model, parameters, standard errors, errors in free run. Of several axes: one for each, in an IdentifiedAxes.
 
     Raises
     ------
@@ -122,6 +136,53 @@ def identify(
     for several in sources.values():
         check_each_once(several)
     check_validation([*sources["fit"], *sources["etve"]], sources["validation"])
+    axes = axes_in(sources["fit"], axis)
+    numbers = {"fit_until_h": fit_until_h, "y_std_um": y_std_um}
+    provenance = partial(_provenance, sources, settings, columns or {}, numbers)
+    calibrations: dict[str, Calibration] = {}
+    words = {one: words_of(one, *sources.values()) for one in axes}
+    # The axis that was measured most gives the heat.
+    for i, one in enumerate(sorted(axes, key=lambda each: -_values(sources["fit"], each))):
+        with words[one].errors():
+            calibrations[one] = _calibrated(
+                {role: of_axis(measured, one) for role, measured in sources.items()},
+                settings,
+                name=name,
+                fit_until_h=fit_until_h,
+                y_std_um=y_std_um,
+                provenance=provenance,
+                like=next(iter(calibrations.values()), None),
+                progress=lambda done, of, i=i: progress(i * of + done, len(axes) * of),  # type: ignore[misc]
+            )
+    calibrations = of_machine({one: calibrations[one] for one in axes})
+    alone = calibrations
+    calibrations, shared = calibrated_together(alone, progress=progress)
+    results = _results(calibrations, sources, words, fit_until_h, reference)
+    if len(results) == 1:
+        return next(iter(results.values()))
+    alone_um = {one: calibration.folds_rms_um for one, calibration in alone.items()}
+    proposed = _pairs(sources["fit"], axes, shared)
+    return IdentifiedAxes(results=results, shared=shared, alone_rms_um=alone_um, pairs=proposed)
+
+
+def _values(measured: Sequence[Measurement], axis: str) -> int:
+    """Return how many values of an axis were measured."""
+    columns = (one.table.columns.get(column_of(axis)) for one in measured)
+    return sum(int(np.isfinite(values).sum()) for values in columns if values is not None)
+
+
+def _calibrated(
+    sources: Mapping[str, Sequence[Measurement]],
+    settings: Settings,
+    *,
+    name: str,
+    fit_until_h: float | None,
+    y_std_um: float | None,
+    provenance: Callable[[], Mapping[str, Any]],
+    like: Calibration | None,
+    progress: Progress,
+) -> Calibration:
+    """Calibrate the model of an axis on its data."""
     remarks: list[str] = []
     runs = {}
     for role, measured in sources.items():
@@ -130,7 +191,7 @@ def identify(
     require_y_noise(", ".join(dict.fromkeys(run.name for run in runs["etve"])), runs["etve"])
     for run in runs["validation"]:
         screen_temperatures(run.name, [run], quiet_air=True)
-    calibration = calibrate(
+    return calibrate(
         runs["fit"],
         settings,
         period_s=PERIOD_S,
@@ -138,22 +199,52 @@ def identify(
         etve=runs["etve"],
         validation=runs["validation"],
         fit_until_s=None if fit_until_h is None else fit_until_h * 3600.0,
-        provenance=_provenance(sources, settings, columns or {}, {"fit_until_h": fit_until_h, "y_std_um": y_std_um}),
+        provenance=provenance(),
         remarks=remarks,
+        like=like,
         progress=progress,
     )
-    criticism = criticise(calibration)
-    free_run = _free_run(calibration.model, sources, fit_until_h)
-    found = figures(calibration, criticism, free_run)
-    model = as_in_file(calibration.model, {key: found[key] for key in _KEPT if key in found})
-    return IdentificationResult(
-        model=model,
-        calibration=calibration,
-        criticism=criticism,
-        comparison=tuple(compare(model, model_of(reference))) if reference is not None else (),
-        free_run=free_run,
-        in_frame=any(measured.in_frame for measured in sources["fit"]),
-    )
+
+
+def _results(
+    calibrations: Mapping[str, Calibration],
+    sources: Mapping[str, Sequence[Measurement]],
+    words: Mapping[str, AxisWords],
+    fit_until_h: float | None,
+    reference: ModelLike | None,
+) -> dict[str, IdentificationResult]:
+    """Return the result of each axis, with the models as one file has them."""
+    views, free_runs, models = {}, {}, {}
+    for axis, calibration in calibrations.items():
+        with words[axis].errors():
+            views[axis] = criticise(calibration)
+            own = {role: of_axis(measured, axis) for role, measured in sources.items()}
+            free_runs[axis] = _free_run(calibration.model, own, fit_until_h)
+        found = words[axis](figures(calibration, views[axis], free_runs[axis]))
+        provenance = dict(calibration.model.provenance) | {key: found[key] for key in _KEPT if key in found}
+        models[axis] = dataclasses.replace(calibration.model, provenance=provenance)
+    models = axes_as_in_file(models)
+    other = {} if reference is None else models_of(reference)
+    return {
+        axis: IdentificationResult(
+            model=models[axis],
+            calibration=calibration,
+            criticism=views[axis],
+            comparison=tuple(compare(models[axis], other[axis])) if axis in other else (),
+            free_run=free_runs[axis],
+            in_frame=any(measured.in_frame for measured in sources["fit"]),
+            words=words[axis],
+        )
+        for axis, calibration in calibrations.items()
+    }
+
+
+def _pairs(measured: Sequence[Measurement], axes: Sequence[str], shared: Sequence[Sequence[str]]) -> tuple[Pair, ...]:
+    """Return the probes that are probably pairs."""
+    records = [record for one in measured for record in one.at_period(PERIOD_S).records]
+    names = [axis for axis in axes if all(column_of(axis) in record.columns for record in records)]
+    values = {axis: [record.columns[column_of(axis)] for record in records] for axis in names}
+    return tuple(pairs(values, PERIOD_S, shared))
 
 
 def _free_run(

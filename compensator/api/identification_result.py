@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from compensator.api.files import Paged
 from compensator.arrays import NAN
+from compensator.axes import AxisWords
 from compensator.data.frames import frame_of
 from compensator.display import Table, Words, is_determined
 from compensator.identify.calibration import Calibration, joined
@@ -45,6 +46,8 @@ class IdentificationResult(Paged):
         Errors in free run as the service runs, on each of the data.
     in_frame : bool
         Whether tables are DataFrames.
+    words : AxisWords
+        Names of columns and texts of the axis.
     """
 
     model: ThermalModel
@@ -53,6 +56,12 @@ class IdentificationResult(Paged):
     comparison: tuple[Row, ...] = ()
     free_run: tuple[FreeRunErrors, ...] = ()
     in_frame: bool = False
+    words: AxisWords = field(default_factory=AxisWords)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the model file."""
+        return self.model.sha256
 
     @property
     def params(self) -> dict[str, float]:
@@ -76,15 +85,16 @@ class IdentificationResult(Paged):
         for name in ("t_s", "y_um", "y_pred_um"):
             columns[name] = np.concatenate([getattr(part, name) for part in parts])
         columns["residual_um"] = columns["y_um"] - columns["y_pred_um"]
+        columns = self.words.table(columns)
         return frame_of(columns) if self.in_frame else columns
 
     def contents(self) -> list[str | Table | Words]:
         """Return the content: verdict, parameters, errors in free run, warnings."""
-        return list(contents(self.calibration, self.criticism, self.comparison, self.free_run))
+        return self.words(list(contents(self.calibration, self.criticism, self.comparison, self.free_run)))
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
-        found = figures(self.calibration, self.criticism, self.free_run)
+        found = self.words(figures(self.calibration, self.criticism, self.free_run))
         if self.comparison:
             found["comparison"] = [dataclasses.asdict(row) for row in self.comparison]
         return found
@@ -106,7 +116,7 @@ class IdentificationResult(Paged):
         """Return the content of the page."""
         from compensator.report.identification import page_of
 
-        return page_of(self.calibration, self.criticism, self.model, self.comparison, self.free_run)
+        return self.words(page_of(self.calibration, self.criticism, self.model, self.comparison, self.free_run))
 
     def plot(self) -> Plot:
         """Plot measured and predicted deformation, and the residual; held-out parts are shaded."""
@@ -115,7 +125,7 @@ class IdentificationResult(Paged):
         hours, y, predicted, held_out = joined(self.calibration.parts)
         curves = [("measured", hours, y), ("predicted, free run", hours, predicted)]
         residual = [("measured − predicted", hours, y - predicted)]
-        figure, axes = stacked([("Y, µm", curves), ("residual, µm", residual)])
+        figure, axes = stacked([(self.words("Y, µm"), curves), ("residual, µm", residual)])
         for axis in axes:
             for first, last in held_out:
                 axis.axvspan(first, last, color="0.9")

@@ -159,7 +159,9 @@ def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> 
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None
-    return diagnose(base, [measured], y_std_um=y_std_um)
+    found = diagnose(base, [measured], y_std_um=y_std_um)
+    assert isinstance(found, DiagnosisResult)  # a base is of one axis
+    return found
 
 
 def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> Diagnosed:

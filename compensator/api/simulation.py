@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from compensator.api.files import ModelLike, model_of
-from compensator.api.simulation_result import SimulationResult
+from compensator.api.files import ModelLike, models_of
+from compensator.api.simulation_result import SimulatedAxes, SimulationResult
 from compensator.arrays import Vector
+from compensator.axes import AxisWords
 from compensator.blas import one_thread
 from compensator.codes import DataRemark, Reason, Remark, SampleQuality
+from compensator.data.axes import AxisLike, with_axis, words_of
 from compensator.data.measurement import DataLike, Measurement, measurements
 from compensator.data.record import SampledRecord, require
 from compensator.data.runs import is_sparse, noise_std
@@ -39,9 +41,10 @@ def simulate(
     data: DataLike,
     *,
     columns: Mapping[str, str] | None = None,
+    axis: AxisLike = None,
     correct: bool = False,
     y_std_um: float | None = None,
-) -> SimulationResult | SimulationFrame:
+) -> SimulationResult | SimulationFrame | SimulatedAxes:
     """Run a model over measured data, free or corrected by measured Y.
 
     Parameters
@@ -52,6 +55,8 @@ def simulate(
         Data with T_Q and AT.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    axis : str or sequence of str, optional
+        Axes to predict; by default all that the model has.
     correct : bool
         Whether each row's `y_pred_um` uses the measured Y of earlier rows, as the service uses probes; by default
         measured Y is never fed back.
@@ -62,16 +67,38 @@ def simulate(
     -------
     SimulationResult or SimulationFrame
         One row for each sample of the model. For a DataFrame the result is a DataFrame with the same columns: its
-        `result` is the SimulationResult, `plot()` plots that, and `to_dict` is that of pandas.
+        `result` is the SimulationResult, `plot()` plots that, and `to_dict` is that of pandas. Of several axes: one
+        SimulationResult for each, in a SimulatedAxes.
 
     Raises
     ------
     CompensatorError
         If model or data cannot be read, or Y is measured too sparsely to show its noise and `y_std_um` is missing.
     """
-    what = model_of(model)
+    models = models_of(model, axis)
     check_y_std(y_std_um)
     measured = measurements(data, "data", columns, needed=True)
+    results = {}
+    for name, what in models.items():
+        words = words_of(name, measured)
+        with words.errors():
+            results[name] = _simulate(what, with_axis(measured, name), words, correct=correct, y_std_um=y_std_um)
+    if len(results) > 1:
+        return SimulatedAxes(results=results)
+    [result] = results.values()
+    if not any(one.in_frame for one in measured):
+        return result
+    from compensator.api.simulation_frame import SimulationFrame
+
+    start = measured[0].table.start_utc_s if len(measured) == 1 else None
+    begin = start and start + float(measured[0].table.t_s.min())
+    return SimulationFrame.of(result, begin, local=all(one.local_time for one in measured))
+
+
+def _simulate(
+    what: ThermalModel, measured: Sequence[Measurement], words: AxisWords, *, correct: bool, y_std_um: float | None
+) -> SimulationResult:
+    """Run the model of an axis over its data."""
     remarks: list[Remark] = []
     parts: list[dict[str, Vector]] = []
     corrected: list[CorrectedRun] = []
@@ -93,21 +120,15 @@ def simulate(
     order = CORRECTED_COLUMNS if correct else COLUMNS
     methods = _methods(corrected)
     free = None if correct else _scores(parts)
-    result = SimulationResult(
-        table={name: _joined(parts, name) for name in order if any(name in part for part in parts)},
+    return SimulationResult(
+        table=words.table({name: _joined(parts, name) for name in order if any(name in part for part in parts)}),
         records=len(parts),
-        remarks=tuple(remarks),
+        remarks=tuple(words(remarks)),
         scores=(methods[-1][1] if methods else None) if free is None else free[0],
-        beside=dict(methods[:-1]),
+        beside=words(dict(methods[:-1])),
         nothing=None if free is None else free[1],
+        words=words,
     )
-    if not any(one.in_frame for one in measured):
-        return result
-    from compensator.api.simulation_frame import SimulationFrame
-
-    start = measured[0].table.start_utc_s if len(measured) == 1 else None
-    begin = start and start + float(measured[0].table.t_s.min())
-    return SimulationFrame.of(result, begin, local=all(one.local_time for one in measured))
 
 
 def _joined(parts: list[dict[str, Vector]], name: str) -> Vector:

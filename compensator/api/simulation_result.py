@@ -9,8 +9,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from compensator.api.axis_results import AxisResults
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
+from compensator.axes import AxisWords
 from compensator.codes import Remark
 from compensator.display import Shown, Table, Words, text_of_all, warnings_of
 from compensator.model.free_run import NOTHING, in_words, table_of_scores
@@ -39,6 +41,8 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         All are then of the measured rows after the first, each predicted from earlier rows.
     nothing : Scores or None
         Of a free run: the same without compensation.
+    words : AxisWords
+        Names of columns and texts of the axis.
     """
 
     table: dict[str, Vector]
@@ -47,6 +51,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
     scores: Scores | None
     beside: dict[str, Scores] = field(default_factory=dict)
     nothing: Scores | None = None
+    words: AxisWords = field(default_factory=AxisWords)
 
     def __getitem__(self, name: str) -> Vector:
         return self.table[name]
@@ -81,9 +86,9 @@ class SimulationResult(Shown, Mapping[str, Vector]):
             words = in_words({name: asdict(row) for name, row in by_name.items()}, "model")
             parts.append(f"{words[0].upper()}{words[1:]}.")
             parts.append(table_of_scores([by_name]))
-        elif "y_free_um" in self.table:
+        elif self.words("y_free_um") in self.table:
             parts.append("No errors: after the first measured Y, which is the zero, none was measured and taken.")
-        return [*parts, *warnings_of(self.remarks, "Remarks")]
+        return [size, *self.words(parts[1:]), *warnings_of(self.remarks, "Remarks")]
 
     def summary(self) -> str:
         """Return the content as text without the remarks, which `compensator simulate` writes to stderr."""
@@ -106,9 +111,41 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         from compensator.api.plotting import stacked
 
         hours = self["t_s"] / 3600.0
-        curves = [("predicted", hours, self["y_pred_um"])]
+        words = self.words
+        curves = [("predicted", hours, self[words("y_pred_um")])]
         if self.scores is None:
-            return stacked([("Y, µm", curves)])[0]
-        curves.insert(0, ("measured", hours, self["y_um"]))
-        residual = [("measured − predicted", hours, self["residual_um"])]
-        return stacked([("Y, µm", curves), ("residual, µm", residual)])[0]
+            return stacked([(words("Y, µm"), curves)])[0]
+        curves.insert(0, ("measured", hours, self[words("y_um")]))
+        residual = [("measured − predicted", hours, self[words("residual_um")])]
+        return stacked([(words("Y, µm"), curves), ("residual, µm", residual)])[0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class SimulatedAxes(AxisResults[SimulationResult]):
+    """Columns of several axes by axis, as `simulate` writes them into one table."""
+
+    @property
+    def table(self) -> dict[str, Vector]:
+        """All columns by name; time and heat once."""
+        return {name: values for result in self.results.values() for name, values in result.table.items()}
+
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
+        """Remarks on the data and on doubtful predictions, each once."""
+        return tuple(dict.fromkeys(remark for result in self.results.values() for remark in result.remarks))
+
+    def summary(self) -> str:
+        """Return the content as text without the remarks."""
+        return text_of_all(part for part in self.contents() if not isinstance(part, Words))
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as CSV.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        with atomic_write(Path(path)) as file:
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.table))
+        return Path(path)

@@ -15,6 +15,11 @@ def _column(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
+def _axis(parser: argparse.ArgumentParser, default: str = "all that the data have") -> None:
+    words = f"axis x, y or z, or NAME of a probe with a column NAME_um; may be repeated (default: {default})"
+    parser.add_argument("--axis", action="append", metavar="NAME", help=words)
+
+
 def _y_std(parser: argparse.ArgumentParser) -> None:
     words = "standard deviation of one measured Y, um; needed where Y was measured now and then, as by a touch probe"
     parser.add_argument("--y-std", type=float, metavar="UM", help=words)
@@ -89,6 +94,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("--correct", action="store_true", help=words)
     _y_std(parser)
     _column(parser)
+    _axis(parser, "all that the model has")
 
 
 def compare(parser: argparse.ArgumentParser) -> None:
@@ -102,6 +108,7 @@ def compare(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="CSV", help="also write measured Y, predictions and residuals as a table")
     _page(parser)
     _column(parser)
+    _axis(parser)
 
 
 def loop(parser: argparse.ArgumentParser) -> None:
@@ -152,6 +159,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; its page is written next to it")
     _page(parser)
     _column(parser)
+    _axis(parser)
     _y_std(parser)
     add("--name", help="name of the model (default: the file name)")
     add = parser.add_argument_group("structure of the model").add_argument
@@ -196,6 +204,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     _page(parser)
     _column(parser)
+    _axis(parser, "all that model and data have")
     _y_std(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 

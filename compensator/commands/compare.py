@@ -11,7 +11,7 @@ from compensator.commands import Answer
 from compensator.commands.outputs import checked_file, checked_page, pages_text
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
-from compensator.model.model_file import load_model
+from compensator.model.model_file import load_axes
 from compensator.model.thermal_model import ThermalModel
 
 
@@ -22,7 +22,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     if given.out is not None:
         checked_file(given.out, "--out", read=(*given.data, *map(Path, given.model)), ending=".csv")
     models = _by_name(given.model)
-    found = compare(models, given.data, columns=roles_of(given.column), from_h=given.from_h)
+    columns = roles_of(given.column)
+    found = compare(models, given.data, columns=columns, axis=given.axis, from_h=given.from_h)
     result, text = found.to_dict(), found.summary()
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
@@ -34,8 +35,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     return Answer(result, text)
 
 
-def _by_name(files: Sequence[str]) -> dict[str, ThermalModel]:
-    """Return models by their names, or by their files where names are the same.
+def _by_name(files: Sequence[str]) -> dict[str, dict[str, ThermalModel]]:
+    """Return the models of all axes by the names of the models, or by their files where names are the same.
 
     Raises
     ------
@@ -45,8 +46,9 @@ def _by_name(files: Sequence[str]) -> dict[str, ThermalModel]:
     for file in files:
         if files.count(file) > 1:
             raise UsageError(f"--model {file}: given {files.count(file)} times, expected each model once")
-    models = [load_model(file) for file in files]
-    names = [model.name for model in models]
+    models = [load_axes(file) for file in files]
+    names = [next(iter(several.values())).name for several in models]
     return {
-        name if names.count(name) == 1 else file: model for file, name, model in zip(files, names, models, strict=True)
+        name if names.count(name) == 1 else file: several
+        for file, name, several in zip(files, names, models, strict=True)
     }

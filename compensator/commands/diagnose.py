@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from compensator.api.diagnosis import FILES, diagnose
-from compensator.api.files import model_of
+from compensator.api.diagnosis import FILES, DiagnosisResult, diagnose
+from compensator.api.files import models_of
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_folder, checked_page, pages_text
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
+from compensator.data.axes import AxisLike
 from compensator.data.measurement import measurements
 from compensator.data.table import roles_of
 from compensator.diagnose.outcome import FOLDS
@@ -29,6 +30,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         given.model,
         given.out,
         columns=roles_of(given.column),
+        axis=given.axis,
         y_std_um=given.y_std,
         scheduler=given.scheduler,
         fit_until_h=given.fit_until,
@@ -43,6 +45,7 @@ def diagnose_files(
     out: Path,
     *,
     columns: Mapping[str, str] | None = None,
+    axis: AxisLike = None,
     y_std_um: float | None = None,
     scheduler: str | None = None,
     fit_until_h: float | None = None,
@@ -51,14 +54,16 @@ def diagnose_files(
 ) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
     checked_folder(out, "--out", read=(*data, *validate, Path(model)), names=FILES)
-    base = model_of(model)
+    bases = models_of(model)
+    period_s = next(iter(bases.values())).period_s
     measured = measurements(data, "data", columns)
-    values = sum(one.hours * 3600.0 / base.period_s * len(one.table.columns) for one in measured)
+    values = sum(one.hours * 3600.0 / period_s * len(one.table.columns) for one in measured)
     with progress_bar("searching") as progress, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
         found = diagnose(
-            base,
+            bases,
             measured,
             columns=columns,
+            axis=axis,
             y_std_um=y_std_um,
             fit_until_h=fit_until_h,
             validate=validate,
@@ -67,12 +72,12 @@ def diagnose_files(
         )
     found.save_all(out, also=also, series=True)
     model_file, page, curves = out / FILES[0], out / FILES[2], out / FILES[3]
-    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page), "series": str(curves)}
-    extended = found.diagnosis.model
-    unchanged = (
-        ""
-        if extended.effects != base.effects or extended.dtf != base.dtf
-        else " (the given model: nothing was added to it)"
-    )
+    results = [found] if isinstance(found, DiagnosisResult) else list(found.values())
+    if len(results) > 1:
+        curves = curves.with_stem(f"{curves.stem}-AXIS")
+    paths = {"model": str(model_file), "model_sha256": found.sha256, "report": str(page), "series": str(curves)}
+    pairs = [(one.diagnosis.model, one.diagnosis.evidence.model) for one in results]
+    added = any(extended.effects != base.effects or extended.dtf != base.dtf for extended, base in pairs)
+    unchanged = "" if added else " (the given model: nothing was added to it)"
     text = f"{found.summary()}\n\nmodel: {model_file}{unchanged}\ncurves: {curves}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from compensator.api.identification import identify
 from compensator.api.identification_result import IdentificationResult
+from compensator.api.identified_axes import IdentifiedAxes
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file, checked_page, pages_text
 from compensator.commands.progress import progress_bar
@@ -31,6 +32,7 @@ def run(arguments: argparse.Namespace) -> Answer:
             validate=given.validate,
             etve=given.etve,
             columns=roles_of(given.column),
+            axis=given.axis,
             name=given.name or given.out.stem,
             kind=given.kind,
             method=given.method,
@@ -48,10 +50,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     return write(found, given.out, also=page)
 
 
-def write(found: IdentificationResult, out: Path, *, also: Path | None = None) -> Answer:
+def write(found: IdentificationResult | IdentifiedAxes, out: Path, *, also: Path | None = None) -> Answer:
     """Write the model file, and beside it the page, named after it: several models may be in one folder."""
     out.parent.mkdir(parents=True, exist_ok=True)
     found.save(out)
     page = found.write_page(calibration_page(out), also=also)
-    files = {"model": str(out), "model_sha256": found.model.sha256, "report": str(page)}
+    files = {"model": str(out), "model_sha256": found.sha256, "report": str(page)}
     return Answer(files | found.to_dict(), f"{found.summary()}\n\nmodel: {out}\n{pages_text(page, also)}")

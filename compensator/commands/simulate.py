@@ -19,7 +19,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     given = arguments
     out = checked_file(given.out, "--out", read=(*given.data, Path(given.model)), ending=".csv")
     columns = roles_of(given.column)
-    found = simulate(given.model, given.data, columns=columns, correct=given.correct, y_std_um=given.y_std)
+    options = {"columns": columns, "axis": given.axis, "correct": given.correct, "y_std_um": given.y_std}
+    found = simulate(given.model, given.data, **options)
     for remark in found.remarks:
         log.warning("%s", remark.marked)
     out.parent.mkdir(parents=True, exist_ok=True)

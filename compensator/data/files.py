@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from compensator.codes import DataRemark, ProbeCode, Remark
-from compensator.config import ROLES
 from compensator.data.cells import text_of, with_points
 from compensator.data.frames import table_in_memory
-from compensator.data.table import TIMES, Table, check_columns, table_of, time_names
+from compensator.data.table import DATA_ROLES, TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Probe, number
 from compensator.recording.reading import messages
@@ -149,7 +148,7 @@ def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark,
             "column as a vector, a table by S = table2struct(T, 'ToScalar', true); save(FILE, '-struct', 'S'); or as "
             f"CSV: {_AS_CSV}"
         )
-    needed = (*ROLES, *TIMES, *roles.values())
+    needed = (*DATA_ROLES, *TIMES, *roles.values())
     others = [name for name, value in arrays.items() if value.shape != time.shape and name not in needed]
     table = table_of(str(path), {name: arrays[name] for name in arrays if name not in others}, roles=roles)
     if not others:

@@ -10,9 +10,8 @@ import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
 from compensator.codes import DataRemark, Remark
-from compensator.config import ROLES
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
-from compensator.data.table import Table
+from compensator.data.table import DATA_ROLES, Table
 from compensator.errors import DataError
 
 #: Longest table, in samples of the model: eleven years of minutes.
@@ -197,7 +196,7 @@ def _check_fault_codes(table: Table) -> None:
     """
     for column, values in table.columns.items():
         is_temperature = column.endswith("_degc")
-        codes = (*_ANYWHERE, *(_MEASURED if is_temperature or column in ROLES else ()))
+        codes = (*_ANYWHERE, *(_MEASURED if is_temperature or column in DATA_ROLES else ()))
         is_code = np.isin(values, (*codes, *_TEMPERATURE) if is_temperature else codes)
         others = values[~is_code & ~np.isnan(values)]
         if not is_code.any() or others.size == 0:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import LARGEST, Vector
+from compensator.axes import COLUMNS as AXIS_COLUMNS
 from compensator.codes import DataRemark, Remark, SampleQuality
 from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
@@ -21,6 +22,8 @@ _SECONDS_IN = {"t_s": 1.0, "time_min": 60.0, "time_h": 3600.0}
 TIMES = ("t_s", "time_utc", "time_min", "time_h")
 #: Rows at least so far apart, s, have whole seconds: a time in hours or minutes is rounded by its logger.
 _WHOLE_S = 5.0
+#: Roles of columns: those of the service, and the deformation of every axis.
+DATA_ROLES = (*ROLES, *(column for column in AXIS_COLUMNS if column not in ROLES))
 #: Largest number of columns.
 COLUMNS = 1000
 #: A column with more words than this share of its numbers is one of words, and left out.
@@ -80,8 +83,8 @@ class Table:
         """
         given = {role: name for role, name in roles.items() if role not in TIMES}
         for role, name in given.items():
-            if role not in ROLES:
-                expected = ", ".join((*ROLES, *TIMES))
+            if role not in DATA_ROLES:
+                expected = ", ".join((*DATA_ROLES, *TIMES))
                 raise DataError(f"{self.name}: --column {role}={name}: expected a role of {expected}")
             _check_named(self.name, role, name, self.columns)
         others = {name: values for name, values in self.columns.items() if name not in given.values()}
@@ -161,7 +164,7 @@ def table_of(
             raise DataError(f"{name}: {column} has {values.size} values, {time_column} {size}, expected equally many")
         if column in (time_column, *TIMES):
             continue
-        is_needed = column in ROLES or column in (roles or {}).values()
+        is_needed = column in DATA_ROLES or column in (roles or {}).values()
         converted, left_out = _numbers(name, column, values, rows, is_needed=is_needed)
         if converted is not None:
             numbers[column] = converted

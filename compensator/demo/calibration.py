@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from compensator.api.identification import identify
+from compensator.api.identification_result import IdentificationResult
 from compensator.arrays import Vector
 from compensator.commands.identify import write
 from compensator.demo.machine import MACHINES
@@ -69,6 +70,7 @@ def paper_case(folder: Path, *, seed: int) -> Sequence[Row]:
     table = folder / "run.csv"
     write_table(table, World(PublishedQuill(), duty, sensors, seed).record(PERIOD_S))
     found = identify(table, name="paper", order=(3, 3, 2), drive="known", reference="quill")
+    assert isinstance(found, IdentificationResult)
     write(found, folder / "model.toml")
     return found.comparison
 

@@ -19,8 +19,8 @@ from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
-_DISPLACEMENT = "_um"
+#: A displacement or tilt is an effect, never a cause: another probe follows Y whatever moves it.
+_DISPLACEMENT = ("_um", "_urad")
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
 #: A record begins warm if what the machine had at its start is more than this share of the span of the DTF's share.

@@ -82,6 +82,8 @@ class Criterion:
 
     def cost_of(self, hypothesis: Hypothesis) -> float:
         """Return what an effect must add to the evidence."""
+        if hypothesis.place in self._evidence.expected:
+            return MARGIN
         unseen = UNSEEN if self._evidence.context.approximate and not hypothesis.effect.observed else 0.0
         return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
 
@@ -90,10 +92,14 @@ class Criterion:
         return self._evidence.noise.is_explained(self.rms(fit) ** 2 * self._evidence.count)
 
     def is_expected(self, fit: Fit) -> bool:
-        """Return whether what is left may come by itself on another day, where the calibration states its error."""
+        """Return whether what is left may come by itself on another day, where the calibration states its error.
+
+        An effect that another axis shows is looked for all the same.
+        """
         noise = self._evidence.noise
         return (
-            noise.own_error_um > 0.0
+            self._evidence.expected <= fit.places
+            and noise.own_error_um > 0.0
             and not self._evidence.is_sparse
             and noise.is_expected(self.rms(fit) ** 2 * self._evidence.count)
         )

@@ -34,6 +34,7 @@ from compensator.diagnose.search import Candidate
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
+from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
@@ -48,7 +49,12 @@ LOWERS = 0.97
 
 
 def diagnose(
-    model: ThermalModel, runs: Sequence[Run], *, progress: Progress = unreported, executor_map: ExecutorMap = map
+    model: ThermalModel,
+    runs: Sequence[Run],
+    *,
+    expected: frozenset[Place] = frozenset(),
+    progress: Progress = unreported,
+    executor_map: ExecutorMap = map,
 ) -> Diagnosis:
     """Find what a model lacks.
 
@@ -58,6 +64,8 @@ def diagnose(
         The base model.
     runs : sequence of Run
         Measured data with y and every channel that was logged.
+    expected : frozenset of Place
+        Effects that another axis of the machine shows.
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -68,11 +76,11 @@ def diagnose(
     DataError
         If there is too little data.
     """
-    evidence = _evidence(model, runs)
+    evidence = _evidence(model, runs, expected)
     progress(0, len(list(evidence.blocks(FOLDS))) + 1)
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
-        found, left_out = without_chips(found, partial(_evidence, model))
+        found, left_out = without_chips(found, partial(_evidence, model, expected=expected))
     found = _as_begun(found)
     evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
@@ -173,9 +181,9 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
     )
 
 
-def _evidence(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
+def _evidence(model: ThermalModel, runs: Sequence[Run], expected: frozenset[Place] = frozenset()) -> Evidence:
     """Return the evidence of runs, with free paths where the model is far off."""
-    evidence = evidence_of(model, runs)
+    evidence = dataclasses.replace(evidence_of(model, runs), expected=expected)
     # The noise of a calibration says nothing about its paths.
     own_um2 = (model.held_out_rms_um or 0.0) ** 2 - evidence.noise.noise_um**2
     return evidence.with_free_paths() if own_um2 > (FAR_OFF * evidence.spread_um) ** 2 else evidence

@@ -33,7 +33,7 @@ from compensator.diagnose.noise import NoiseTest, noise_floor, own_error
 from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Context
+from compensator.model.effects.hypothesis import Context, Place
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.thermal_model import ThermalModel
 
@@ -73,6 +73,8 @@ class Evidence:
         White noise of the measured deformation, µm.
     free_paths : bool
         Whether nothing is known of the base's paths: the residual is then the measured deformation itself.
+    expected : frozenset of Place
+        Effects that another axis of the machine shows: to name one of them is no choice among many.
     """
 
     model: ThermalModel
@@ -86,6 +88,7 @@ class Evidence:
     noise: NoiseTest
     probe_um: float
     free_paths: bool = False
+    expected: frozenset[Place] = frozenset()
 
     @property
     def count(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +16,9 @@ from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
 from compensator.identify.arx import free_run_rms
+from compensator.identify.choice import Candidate
 from compensator.identify.deformation import DeformationFit, PathFit, fit_deformation
+from compensator.identify.output_error import OutputErrorFit
 from compensator.identify.settings import Settings
 from compensator.identify.temperature import TemperatureFit, fit_temperature
 from compensator.model.engine import Engine
@@ -96,6 +99,8 @@ class Calibration:
         White noise of `t_q_degc`, `at_degc`, `y_um`, in their units.
     remarks : tuple of str
         Corrections of the data, and changes of the structure.
+    checked : tuple of Run
+        Runs that took no part in the fit, of which some parts are.
     """
 
     model: ThermalModel
@@ -109,6 +114,7 @@ class Calibration:
     folds_rms_um: float
     noise: Mapping[str, float]
     remarks: tuple[str, ...]
+    checked: tuple[Run, ...] = ()
 
     @property
     def ttf_fit_pct(self) -> float:
@@ -172,6 +178,7 @@ def calibrate(
     validation: Sequence[Run] = (),
     provenance: Mapping[str, Any] | None = None,
     remarks: Sequence[str] = (),
+    like: Calibration | None = None,
     progress: Progress = unreported,
 ) -> Calibration:
     """Fit a thermal model to measured runs.
@@ -194,6 +201,8 @@ def calibrate(
         Origin of the data, for the model file.
     remarks : sequence of str
         Corrections that were made while reading the data.
+    like : Calibration, optional
+        That of another axis of the machine, whose TTF and estimator are used: heat and temperatures are the machine's.
     progress : callable
         Called with the number of structures done and their total.
 
@@ -207,7 +216,7 @@ def calibrate(
     DataError
         If no model can be fitted to the data; the message states the reason.
     """
-    kind = _kind(runs, settings)
+    kind = _kind(runs, settings) if like is None else like.model.kind
     data = ", ".join(dict.fromkeys(run.name for run in runs)) or name
     screen(data, runs, period_s, needs_heat=kind == "heat")
     used = [_mask(run, fit_until_s) for run in runs]
@@ -216,8 +225,8 @@ def calibrate(
     # A run that starts after the hours of the fit is held out completely.
     later = [run for run, mask in zip(runs, used, strict=True) if not mask.any() and np.isfinite(run.y_um).any()]
     runs, used = [run for run, mask in zip(runs, used, strict=True) if mask.any()], [m for m in used if m.any()]
-    temperature = None
-    if kind == "heat":
+    temperature = like.temperature if like is not None else None
+    if kind == "heat" and temperature is None:
         temperature = fit_temperature(
             runs, _until(runs, fit_until_s), settings.ttf, period_s=period_s, folds=settings.folds
         )
@@ -232,7 +241,7 @@ def calibrate(
     noise = noise_of(runs)
     noise |= {name: max(noise[name], LEAST_NOISE_K) for name in ("t_q_degc", "at_degc")}
     sparse = any(run.has_sparse_y for run in runs)
-    own_um = _own_error_um(deformation, chosen.rms, noise["y_um"]) if sparse else chosen.rms
+    y_std_um, held_out_um = _errors_um(deformation, chosen.rms, noise["y_um"], sparse=sparse)
     model = ThermalModel(
         name=name,
         kind=kind,
@@ -240,12 +249,10 @@ def calibrate(
         ttf=_path("TTF", kind, PathFit.of("TTF", temperature.fit)) if temperature else None,
         dtf=_path("DTF", kind, deformation.dtf),
         tdtf=_path("TDTF", kind, deformation.tdtf),
-        estimator=_estimator(runs, drives, noise, kind),
+        estimator=_estimator(runs, drives, noise, kind) if like is None else like.model.estimator,
         validity=_validity(runs, used, kind),
-        y_std_um=own_um
-        if sparse
-        else float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
-        held_out_rms_um=own_um if sparse else chosen.rms,
+        y_std_um=y_std_um,
+        held_out_rms_um=held_out_um,
         provenance=dict(provenance or {}),
     )
     runs, checked, missed = _without_isolated(model, deformation, runs, used, [*later, *validation])
@@ -263,7 +270,75 @@ def calibrate(
         folds_rms_um=chosen.rms,
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
+        checked=tuple(checked),
     )
+
+
+def with_deformation(calibration: Calibration, result: OutputErrorFit, candidate: Candidate) -> Calibration:
+    """Return a calibration with another fit of the deformation, that with the time constants of several axes.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration of the axis alone.
+    result : OutputErrorFit
+        The other fit of the same data.
+    candidate : Candidate
+        Its structure and errors on held-out blocks.
+    """
+    before, old = calibration.deformation, calibration.model
+    together = before.tdtf.fit is before.dtf.fit
+    candidates = [dataclasses.replace(one, chosen=False) for one in before.candidates]
+    deformation = dataclasses.replace(
+        before,
+        dtf=PathFit.of("DTF", result, 0),
+        tdtf=PathFit.of("TDTF", result, 1) if together else before.tdtf,
+        candidates=(*candidates, candidate),
+    )
+    sparse = any(run.has_sparse_y for run in calibration.runs)
+    y_std_um, held_out_um = _errors_um(deformation, candidate.rms, calibration.noise["y_um"], sparse=sparse)
+    model = dataclasses.replace(
+        old,
+        dtf=_path("DTF", old.kind, deformation.dtf),
+        tdtf=_path("TDTF", old.kind, deformation.tdtf),
+        y_std_um=y_std_um,
+        held_out_rms_um=held_out_um,
+    )
+    parts = _parts(model, deformation, calibration.runs, calibration.used, calibration.checked)
+    return dataclasses.replace(
+        calibration, model=model, deformation=deformation, parts=tuple(parts), folds_rms_um=candidate.rms
+    )
+
+
+def of_machine(calibrations: Mapping[str, Calibration]) -> dict[str, Calibration]:
+    """Return the calibrations of all axes with the validity of the machine: where every axis was measured.
+
+    Raises
+    ------
+    DataError
+        If no temperature is common to the data of all axes.
+    """
+    ranges = [one.model.validity for one in calibrations.values()]
+    validity = {
+        name: (max(one[name][0] for one in ranges), min(one[name][1] for one in ranges))
+        for name in ranges[0]
+        if all(name in one for one in ranges)
+    }
+    for name, (low, high) in validity.items():
+        if low >= high:
+            raise DataError(f"{name}: the axes were measured at different temperatures, expected a common range")
+    return {
+        axis: dataclasses.replace(one, model=dataclasses.replace(one.model, validity=validity, axis=axis))
+        for axis, one in calibrations.items()
+    }
+
+
+def _errors_um(deformation: DeformationFit, rms_um: float, noise_um: float, *, sparse: bool) -> tuple[float, float]:
+    """Return the standard deviation of the model's own error, and its error on held-out data, µm."""
+    if sparse:
+        own_um = _own_error_um(deformation, rms_um, noise_um)
+        return own_um, own_um
+    return float(np.sqrt(max(rms_um**2 - noise_um**2, (0.3 * noise_um) ** 2))), rms_um
 
 
 def _chips(runs: Sequence[Run], deformation: DeformationFit) -> list[Mask]:

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.axes import label_of
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure, fit_output_error
@@ -47,6 +48,8 @@ class Candidate:
         Akaike's criterion where it chooses; NaN elsewhere.
     chosen : bool
         Whether it was chosen.
+    shared_with : tuple of str
+        Axes with which it has common time constants.
     """
 
     structure: Structure
@@ -57,6 +60,13 @@ class Candidate:
     parameters: int
     information: float = math.nan
     chosen: bool = False
+    shared_with: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """The structure in words."""
+        others = ", ".join(map(label_of, self.shared_with))
+        return f"{self.structure}{f', time constants shared with {others}' if others else ''}"
 
 
 def fit(

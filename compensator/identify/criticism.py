@@ -231,7 +231,7 @@ def criticise(calibration: Calibration) -> Criticism:
         )
     ]
     if calibration.temperature is not None:
-        known = [run.heat_w for run in calibration.runs if run.heat_w is not None]
+        known = [segment.inputs[0] for segment in calibration.temperature.segments]
         residuals.insert(0, view_residual("T_Q − AT", calibration.temperature.fit.residuals, {"heat": known}))
     warnings = _Warnings(calibration, paths, residuals)
     return Criticism(paths=paths, residuals=tuple(residuals), warnings=warnings.all())

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -325,6 +326,8 @@ def _sensitivities(output: Vector, poles: Vector, slopes: Vector) -> Matrix:
 class _Problem:
     """The projected least-squares problem of some segments and a structure."""
 
+    residual: Vector
+
     def __init__(self, segments: Sequence[Segment], structure: Structure, period_s: float) -> None:
         self.segments, self.structure, self.period_s = segments, structure, period_s
         self.rows = [int(segment.used.sum()) for segment in segments]
@@ -455,11 +458,36 @@ def fit_output_error(
     needed = structure.parameters + sum(structure.order * (not s.rest) + structure.offset for s in segments)
     if problem.count <= needed:
         raise DataError(f"{problem.count} measured sample(s) for {needed} parameters ({structure})")
-    low, high = _bounds(problem, period_s)
+    search(problem, starts, bounds_of(problem, period_s))
+    return result_of(problem)
+
+
+class Projected(Protocol):
+    """A least-squares problem in log time constants from which the amplitudes are projected out."""
+
+    structure: Structure
+
+    @property
+    def residual(self) -> Vector:
+        """Projected residual where it was solved last."""
+
+    def solve(self, log_taus: Vector) -> None:
+        """Project at these log time constants."""
+
+    def fun(self, log_taus: Vector) -> Vector:
+        """Return the projected residual."""
+
+    def jac(self, log_taus: Vector) -> Matrix:
+        """Return its Jacobian."""
+
+
+def search(problem: Projected, starts: Sequence[Sequence[float]], bounds: tuple[float, float]) -> None:
+    """Solve a problem at the best log time constants between two bounds, searched from several starts."""
+    low, high = bounds
     best: tuple[float, Vector] | None = None
-    for start in starts if structure.order else [()]:
+    for start in starts if problem.structure.order else [()]:
         at = np.clip(np.log(np.sort(np.asarray(start, dtype=float))), low + 1e-6, high - 1e-6)
-        if structure.order:
+        if problem.structure.order:
             found = least_squares(
                 problem.fun,
                 at,
@@ -479,10 +507,9 @@ def fit_output_error(
             best = (cost, at)
     assert best is not None
     problem.solve(best[1])
-    return _result(problem)
 
 
-def _bounds(problem: _Problem, period_s: float) -> tuple[float, float]:
+def bounds_of(problem: _Problem, period_s: float) -> tuple[float, float]:
     """Return bounds of log τ: from where the pole would turn negative to the longest stretch that is used.
 
     A mode slower than the data cannot be distinguished from a ramp, and in free run a ramp grows without limit.
@@ -497,7 +524,8 @@ def _span(used: Mask) -> int:
     return int(at[-1] - at[0]) + 1 if at.size else 0
 
 
-def _result(problem: _Problem) -> OutputErrorFit:
+def result_of(problem: _Problem) -> OutputErrorFit:
+    """Return the fit where a problem was solved last."""
     structure = problem.structure
     width = structure.amplitudes
     coefficients = problem.coefficients
@@ -517,7 +545,7 @@ def _result(problem: _Problem) -> OutputErrorFit:
         structure=structure,
         period_s=problem.period_s,
         taus_min=problem.taus.copy(),
-        longest_min=float(np.exp(_bounds(problem, problem.period_s)[1])),
+        longest_min=float(np.exp(bounds_of(problem, problem.period_s)[1])),
         amplitudes=coefficients[:width].copy(),
         nuisances=tuple(nuisances),
         covariance=covariance[:keep, :keep],

@@ -2,6 +2,9 @@
 
 The reader reads the file table by table and refuses what it does not know, naming file, table, key,
 value and what was expected. The writer adds comments to the numbers.
+
+A file of several axes has a part `[axis.NAME]` for each, and what is the same for all of them once above: the
+estimation of the heat, the sample period, the validity. A file without parts is of Y.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from importlib import resources
 from pathlib import Path as FilePath
 from typing import Any
 
+from compensator.axes import FIRST, NAME, label_of
 from compensator.errors import CompensatorError, ModelError
 from compensator.input_file import MODEL_BYTES, parse_toml, read_file
 from compensator.model.effects import Effect, effect_from, kinds
@@ -42,6 +46,10 @@ _TOP = (
     "effect",
     "description",
 )
+#: What the part of an axis may have; the rest is the machine's and stands once in the file.
+AXIS_TABLES = ("paths", "alternatives", "uncertainty", "effect", "provenance")
+#: Largest number of axes.
+MOST_AXES = 20
 #: Largest number of coefficients of a polynomial, of effects, of alternatives, and of ranges.
 COEFFICIENTS, EFFECTS, ALTERNATIVES, RANGES = 20, 100, 20, 200
 #: Largest sum of all delays, samples; each sample is part of the state in every recording.
@@ -54,13 +62,15 @@ _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
 _FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
 
 
-def load_model(name: str | FilePath) -> ThermalModel:
-    """Read a model.
+def load_model(name: str | FilePath, axis: str = FIRST) -> ThermalModel:
+    """Read the model of an axis.
 
     Parameters
     ----------
     name : str or pathlib.Path
         A TOML file, or the name of a model that ships with the package.
+    axis : str
+        The axis; by default Y, the only one of a file without parts.
 
     Returns
     -------
@@ -70,14 +80,25 @@ def load_model(name: str | FilePath) -> ThermalModel:
     Raises
     ------
     ModelError
-        Naming file, table and key, when the file cannot be read or its dynamics cannot be run.
+        Naming file, table and key, when the file cannot be read, has no such axis, or its dynamics cannot be run.
 
     Examples
     --------
     >>> round(load_model("quill").dtf.in_s().dc_gain, 4)
     1.0182
     """
-    return parse_model(read_model_bytes(name), source=str(name))
+    return parse_model(read_model_bytes(name), source=str(name), axis=axis)
+
+
+def load_axes(name: str | FilePath) -> dict[str, ThermalModel]:
+    """Read the models of all axes of a file, by axis.
+
+    Raises
+    ------
+    ModelError
+        As `load_model`.
+    """
+    return parse_axes(read_model_bytes(name), source=str(name))
 
 
 def read_model_bytes(name: str | FilePath) -> bytes:
@@ -99,8 +120,8 @@ def read_model_bytes(name: str | FilePath) -> bytes:
         ) from error
 
 
-def parse_model(data: bytes, *, source: str) -> ThermalModel:
-    """Make a model of the bytes of its file.
+def parse_model(data: bytes, *, source: str, axis: str = FIRST) -> ThermalModel:
+    """Make the model of an axis of the bytes of its file.
 
     Parameters
     ----------
@@ -108,6 +129,28 @@ def parse_model(data: bytes, *, source: str) -> ThermalModel:
         TOML, UTF-8.
     source : str
         Name for messages.
+    axis : str
+        The axis.
+
+    Raises
+    ------
+    ModelError
+        As `load_model`.
+    """
+    models = parse_axes(data, source=source)
+    if axis not in models:
+        has = ", ".join(map(label_of, models))
+        raise ModelError(f"{source}: a model of {has}, expected one of {label_of(axis)}")
+    return models[axis]
+
+
+def parse_axes(data: bytes, *, source: str) -> dict[str, ThermalModel]:
+    """Make the models of all axes of the bytes of their file.
+
+    Parameters
+    ----------
+    data, source
+        As `parse_model`.
 
     Raises
     ------
@@ -118,10 +161,43 @@ def parse_model(data: bytes, *, source: str) -> ThermalModel:
         table = parse_toml(data)
     except ValueError as error:
         raise ModelError(f"{source}: not a TOML file, expected a model: {error}") from error
+    sha256 = hashlib.sha256(data).hexdigest()
     try:
-        return _model(table, hashlib.sha256(data).hexdigest())
+        if "axis" not in table:
+            return {FIRST: _model(table, sha256)}
+        return {axis: _of_axis(axis, own, sha256) for axis, own in _parts(table).items()}
     except CompensatorError as error:
         raise ModelError(f"{source}: {error}") from error
+
+
+def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the table of each axis, as in a file of its own: its part, with what stands once for all axes."""
+    shared = {key: value for key, value in table.items() if key != "axis"}
+    for key, known in (("paths", ("TTF",)), ("provenance", None)):
+        TomlTable(key, shared.get(key, {}), known)
+    for key in ("alternatives", "uncertainty", "effect"):
+        if key in shared:
+            raise ModelError(f"{key}: expected in the part of an axis, such as axis.{next(iter(table['axis']), 'y')}")
+    parts = {}
+    for axis, value in TomlTable("axis", table["axis"], most=MOST_AXES).table.items():
+        if NAME.fullmatch(axis) is None:
+            raise ModelError(f"axis.{shown(axis)}: expected a name such as z")
+        own = TomlTable(f"axis.{axis}", value, AXIS_TABLES).table
+        both = {
+            key: {**shared.get(key, {}), **TomlTable(f"axis.{axis}.{key}", own.get(key, {})).table}
+            for key in ("paths", "provenance")
+        }
+        parts[axis] = {**shared, **own, **both}
+    if not parts:
+        raise ModelError("axis: no axis in it, expected one at least")
+    return parts
+
+
+def _of_axis(axis: str, table: Mapping[str, Any], sha256: str) -> ThermalModel:
+    try:
+        return replace(_model(table, sha256), axis=axis)
+    except CompensatorError as error:
+        raise ModelError(f"axis.{axis}: {error}") from error
 
 
 def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:

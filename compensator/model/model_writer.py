@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 
 from compensator.atomic_write import atomic_write
+from compensator.axes import FIRST, label_of
 from compensator.errors import ModelError
-from compensator.model.effects import Effect
-from compensator.model.model_file import GAIN_STD_KEY, HELD_OUT_KEY, load_model, parse_model
+from compensator.model.model_file import GAIN_STD_KEY, HELD_OUT_KEY, load_axes, parse_axes
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+#: What all axes of a machine have in common.
+_SHARED = ("name", "kind", "period_s", "inputs", "ttf", "estimator", "validity")
 
 
 def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
@@ -45,16 +47,22 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     Examples
     --------
     >>> import tempfile
+    >>> from compensator.model.model_file import load_model
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     len(write_model(FilePath(folder) / "copy.toml", load_model("quill")).sha256)
     64
     """
-    text = dump_model(model)
+    return write_axes(path, {model.axis: model})[model.axis]
+
+
+def write_axes(path: FilePath, models: Mapping[str, ThermalModel]) -> dict[str, ThermalModel]:
+    """Write the models of all axes into one file; as `write_model`."""
+    text = dump_axes(models)
     # Before the old file is replaced: the reader knows bounds that the model does not.
-    parse_model(text.encode("utf-8"), source=str(path))
+    parse_axes(text.encode("utf-8"), source=str(path))
     with atomic_write(path) as file:
         file.write(text)
-    return load_model(path.absolute())  # a bare "quill" is the name of a built-in model
+    return load_axes(path.absolute())  # a bare "quill" is the name of a built-in model
 
 
 def dump_model(model: ThermalModel) -> str:
@@ -77,14 +85,85 @@ def dump_model(model: ThermalModel) -> str:
 
     Examples
     --------
+    >>> from compensator.model.model_file import load_model
     >>> model = load_model("quill")
-    >>> parse_model(dump_model(model).encode(), source="copy").dtf == model.dtf
+    >>> parse_axes(dump_model(model).encode(), source="copy")["y"].dtf == model.dtf
     True
     """
     return "\n".join(_lines(model)) + "\n"
 
 
+def dump_axes(models: Mapping[str, ThermalModel]) -> str:
+    """Return the text of a model file of several axes; of Y alone, that of `dump_model`.
+
+    Parameters
+    ----------
+    models : mapping of str to ThermalModel
+        By axis. The estimation of the heat, the sample period and the validity are those of the machine.
+
+    Returns
+    -------
+    str
+        TOML that `parse_axes` reads back to the same numbers.
+
+    Raises
+    ------
+    ModelError
+        As `dump_model`, and if the models differ in what is the machine's.
+    """
+    first, *others = models.values()
+    for axis, model in models.items():
+        if model.axis != axis:
+            raise ModelError(f"axis.{axis}: a model of {label_of(model.axis)}, expected one of {label_of(axis)}")
+    if not others:
+        return dump_model(first)
+    for model in others:
+        for key in _SHARED:
+            if getattr(model, key) != getattr(first, key):
+                raise ModelError(
+                    f"axis.{model.axis}: its {key} differs from that of axis {first.axis}, expected one of the machine"
+                )
+    return "\n".join(_lines_of_axes(models)) + "\n"
+
+
 def _lines(model: ThermalModel) -> Iterator[str]:
+    if model.axis != FIRST:
+        yield from _lines_of_axes({model.axis: model})
+        return
+    yield from _head(model)
+    yield from _paths(model, ("TTF", "DTF", "TDTF"), "")
+    yield from _alternatives(model, "")
+    yield from _estimator(model.kind, model.estimator)
+    yield from _validity(model)
+    yield from _own_error(model, "")
+    yield from _effects(model, "")
+    yield from _provenance({**_kept(model), **model.provenance}, "")
+
+
+def _lines_of_axes(models: Mapping[str, ThermalModel]) -> Iterator[str]:
+    first = next(iter(models.values()))
+    yield from _head(first)
+    yield from _paths(first, ("TTF",), "")
+    yield from _estimator(first.kind, first.estimator)
+    yield from _validity(first)
+    shared = {
+        key: value
+        for key, value in first.provenance.items()
+        if all(model.provenance.get(key) == value for model in models.values())
+    }
+    yield from _provenance(shared, "")
+    for axis, model in models.items():
+        where = f"axis.{axis}."
+        yield from ("", _comment(f"Axis {label_of(axis)}."))
+        yield from _paths(model, ("DTF", "TDTF"), where)
+        yield from _alternatives(model, where)
+        yield from _own_error(model, where)
+        yield from _effects(model, where)
+        own = {key: value for key, value in model.provenance.items() if key not in shared}
+        yield from _provenance({**_kept(model), **own}, where)
+
+
+def _head(model: ThermalModel) -> Iterator[str]:
     drive = "heat, W" if model.kind == "heat" else "T_Q - AT, K (the heat was not measured, so there is no TTF)"
     yield _comment(f"Thermal model {model.name}. The DTF is driven by {drive}; the deformation is in um.")
     yield "# Functions of s: ascending powers, time in minutes. b and a: powers of 1/z at the sample period."
@@ -98,35 +177,58 @@ def _lines(model: ThermalModel) -> Iterator[str]:
             "inputs": model.inputs,
         },
     )
+
+
+def _paths(model: ThermalModel, names: Sequence[str], where: str) -> Iterator[str]:
     purposes = {
         "TTF": "Heat to T_Q - AT; its inverse gives the heat",
         "DTF": f"{'Heat' if model.kind == 'heat' else 'T_Q - AT'} to deformation",
         "TDTF": "Change of the ambient to deformation",
     }
-    for name, purpose in purposes.items():
+    for name in names:
         path: Path | None = getattr(model, name.lower())
         if path is not None:
-            yield from _path(f"paths.{name}", path, purpose, {})
+            yield from _path(f"{where}paths.{name}", path, purposes[name], {})
+
+
+def _alternatives(model: ThermalModel, where: str) -> Iterator[str]:
     for name, (replaces, path) in model.alternatives.items():
-        yield from _path(f"alternatives.{_key(name)}", path, f"Stands in for {replaces}", {"replaces": replaces})
-    yield from _estimator(model.kind, model.estimator)
+        place = f"{where}alternatives.{_key(name)}"
+        yield from _path(place, path, f"Stands in for {replaces}", {"replaces": replaces})
+
+
+def _validity(model: ThermalModel) -> Iterator[str]:
     if model.validity:
         yield from (
             "",
             "# Ranges that the model is trusted in; outside them the service holds. The key ends in the unit.",
         )
         yield from ("[validity]", *_pairs("validity", {key: list(bounds) for key, bounds in model.validity.items()}))
-    yield from ("", "# Standard deviation of the model's own error in y, um.", "[uncertainty]")
-    yield from _pairs("uncertainty", {"y_std_um": model.y_std_um})
+
+
+def _own_error(model: ThermalModel, where: str) -> Iterator[str]:
+    yield from ("", "# Standard deviation of the model's own error in y, um.", f"[{where}uncertainty]")
+    yield from _pairs(f"{where}uncertainty", {"y_std_um": model.y_std_um})
+
+
+def _effects(model: ThermalModel, where: str) -> Iterator[str]:
     for number, effect in enumerate(model.effects, start=1):
-        yield from _effect(f"effect {number}", effect)
+        yield from ("", _comment(effect.comment), f"[[{where}effect]]")
+        yield from _pairs(f"effect {number}", {"kind": effect.kind, **effect.to_table()})
+
+
+def _kept(model: ThermalModel) -> dict[str, Any]:
+    """Return what the file keeps in the provenance: the calibration's error and the standard errors of its gains."""
     kept: dict[str, Any] = {} if model.held_out_rms_um is None else {HELD_OUT_KEY: model.held_out_rms_um}
     paths = {"TTF": model.ttf, "DTF": model.dtf, "TDTF": model.tdtf}
     stds = {name: path.gain_std for name, path in paths.items() if path is not None and path.gain_std is not None}
-    if stds:
-        kept[GAIN_STD_KEY] = stds
-    if provenance := {**kept, **model.provenance}:
-        yield from ("", "# Where the model comes from.", "[provenance]", *_pairs("provenance", provenance))
+    return kept | {GAIN_STD_KEY: stds} if stds else kept
+
+
+def _provenance(provenance: Mapping[str, Any], where: str) -> Iterator[str]:
+    if provenance:
+        place = f"{where}provenance"
+        yield from ("", "# Where the model comes from.", f"[{place}]", *_pairs(place, provenance))
 
 
 def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Iterator[str]:
@@ -187,10 +289,6 @@ def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
             "at_walk_std_k": estimator.at_walk_std_k,
         },
     )
-
-
-def _effect(where: str, effect: Effect) -> Iterator[str]:
-    yield from ("", _comment(effect.comment), "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.to_table()}))
 
 
 def _comment(text: str) -> str:

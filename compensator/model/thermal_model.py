@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from compensator.axes import FIRST, label_of
 from compensator.display import Shown, Table, Words, with_std
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
@@ -157,6 +158,8 @@ class ThermalModel(Shown):
         Where it comes from: source, date, hash of the data, fits.
     sha256 : str
         Hash of the model file's bytes; empty for a model that was not read from a file.
+    axis : str
+        The axis whose deformation it gives.
     """
 
     name: str
@@ -174,6 +177,7 @@ class ThermalModel(Shown):
     alternatives: Mapping[str, tuple[str, Path]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
+    axis: str = FIRST
 
     def __post_init__(self) -> None:
         check_runnable(self)
@@ -183,7 +187,8 @@ class ThermalModel(Shown):
         paths = {"TTF": self.ttf, "DTF": self.dtf, "TDTF": self.tdtf}
         rows = [[name, *_path_cells(path)] for name, path in paths.items() if path is not None]
         head = ["path", "gain at rest", "unit", "time constants, min"]
-        parts: list[str | Table | Words] = [f"model {self.name}", Table(head=head, rows=rows)]
+        axis = "" if self.axis == FIRST else f", axis {label_of(self.axis)}"
+        parts: list[str | Table | Words] = [f"model {self.name}{axis}", Table(head=head, rows=rows)]
         if self.effects:
             lines = [" ".join(filter(None, (effect.kind, effect.explanation))) for effect in self.effects]
             parts.append(Words(title="Effects", lines=lines))

@@ -252,7 +252,7 @@ def _choice(calibration: Calibration) -> Block:
             head=["structure", "held-out rms, µm", "worst block, µm", ""],
             rows=[
                 [
-                    str(c.structure),
+                    c.label,
                     f"{c.rms:.3f}",
                     f"{max(c.fold_rms):.3f}",
                     "chosen" if c.chosen else "" if c.supported else "not supported by the data",

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+from compensator.axes import label_of
 from compensator.diagnose.summary import headline
 from compensator.identify.summary import verdict as calibration_verdict
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, parse_toml, read_file, resolved
 from compensator.model.model_file import HELD_OUT_KEY
+from compensator.report.axes import worst
 from compensator.report.diagnosis import tone_of as diagnosis_tone
 from compensator.report.identification import tone_of
 from compensator.report.page import Block, Cell, Link, Page, Table, Tone
@@ -56,7 +59,11 @@ def _diagnosis(page: Path) -> PageFile | None:
         return None
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
         found = json.loads(read_file(page.with_name("diagnosis.json"), RESULT_BYTES))
-        return PageFile(path=page, title="Diagnosis", verdict=headline(found), tone=diagnosis_tone(found))
+        axes = found.get("axes", {})
+        tone = worst(diagnosis_tone(one) for one in axes.values() or [found])
+        words = " ".join(one["sentence"] for one in found.get("machine", ()))
+        each = " ".join(f"{label_of(axis)}: {headline(one)}" for axis, one in axes.items()) or headline(found)
+        return PageFile(path=page, title="Diagnosis", verdict=words or each, tone=tone)
     return None
 
 
@@ -66,12 +73,21 @@ def _calibration(page: Path) -> PageFile | None:
     for path in [own] if page.name.endswith(_CALIBRATION) else sorted(page.parent.glob("*.toml")):
         with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
             model = parse_toml(read_file(path, MODEL_BYTES))
-            origin = model["provenance"]
-            errors = {name: origin[name] for name in ("free_run", "parts") if name in origin}
-            errors["folds_rms_um"] = origin[HELD_OUT_KEY]
+            parts = {axis: part["provenance"] for axis, part in model.get("axis", {}).items()}
+            each = {axis: _errors(origin) for axis, origin in (parts or {"": model["provenance"]}).items()}
+            words = " ".join(
+                f"{label_of(axis)}: {calibration_verdict(one)}" if axis else calibration_verdict(one)
+                for axis, one in each.items()
+            )
             title = f"Calibration: {model['name']}"
-            return PageFile(path=page, title=title, verdict=calibration_verdict(errors), tone=tone_of(errors))
+            return PageFile(path=page, title=title, verdict=words, tone=worst(map(tone_of, each.values())))
     return None
+
+
+def _errors(origin: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the errors that the provenance of a model states."""
+    errors = {name: origin[name] for name in ("free_run", "parts") if name in origin}
+    return errors | {"folds_rms_um": origin[HELD_OUT_KEY]}
 
 
 def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> Page:

@@ -1,0 +1,96 @@
+"""Several axes: an effect of one is looked for on the others, one of a single probe is first suspected in the probe."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.cli import main
+from compensator.data.axes import of_axis
+from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose.criterion import MARGIN, Criterion
+from compensator.diagnose.evidence import evidence_of
+from compensator.model.effects.hypothesis import proposals
+from compensator.model.model_file import load_axes
+from compensator.model.model_writer import write_axes
+from compensator.report.results import pages_in
+from tests.cli.test_axes import write
+from tests.diagnose.axes_data import machine, models
+
+PLACE = ("input", "", "coolant_degc")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return tc.diagnose(models(), machine(1, {"y": 2.0, "z": -4.0}))
+
+
+def test_an_effect_of_two_axes_is_named_with_its_axes(found):
+    [effect] = found.machine
+    assert effect.place == PLACE and [share.axis for share in effect.seen] == ["z", "y"] and not effect.suspect
+    z, y, x = effect.shares
+    assert z.moves_um == pytest.approx(-2.0 * y.moves_um, rel=0.1) and y.moves_um > 0.0, "with the coolant, against it"
+    assert x.axis == "x" and abs(x.moves_um) < 4.0 * x.std_um < 1.0
+    assert "moves Z by −" in effect.sentence and "X not (" in effect.sentence
+    assert found.verdict == "explained" and found["x"].verdict == "adequate"
+
+
+def test_each_axis_gets_its_own_effect_in_one_file(found, tmp_path):
+    loaded = load_axes(found.save(tmp_path / "model.toml"))
+    assert [len(loaded[axis].effects) for axis in ("x", "y", "z")] == [0, 1, 1]
+    table = machine(1, {"y": 2.0, "z": -4.0})
+    before, after = tc.simulate(models(), table), tc.simulate(loaded, table)
+    for axis in ("y", "z"):
+        assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
+
+
+def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
+    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}))
+    [effect] = found.machine
+    assert effect.place[0] == "step" and effect.suspect == "z"
+    assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
+
+
+def test_y_alone_is_diagnosed_as_without_the_other_axes():
+    table = machine(1, {"y": 2.0, "z": -4.0})
+    alone = tc.diagnose(models()["y"], {name: v for name, v in table.items() if name not in ("x_um", "z_um")})
+    chosen = tc.diagnose(models(), table, axis="y")
+    assert chosen.to_dict() | {"free_run": []} == alone.to_dict() | {"free_run": []}
+
+
+def test_what_another_axis_shows_is_no_choice_among_many():
+    model = models()["y"]
+    [runs] = [runs_in(of_axis(measurements(machine(3, {}), "data"), "y"))[0]]
+    evidence = evidence_of(model, runs)
+    hypotheses = proposals(evidence.context)
+    expected = dataclasses.replace(evidence, expected=frozenset({PLACE}))
+    costs = {
+        one.place: (Criterion(expected, hypotheses).cost_of(one), Criterion(evidence, hypotheses).cost_of(one))
+        for one in hypotheses
+    }
+    assert costs[PLACE][0] == MARGIN < costs[PLACE][1]
+    others = [pair for place, pair in costs.items() if place != PLACE]
+    assert others and all(with_it == without for with_it, without in others)
+
+
+def test_the_command_writes_the_axis_of_each_effect(tmp_path, capsys):
+    write(tmp_path / "run.csv", {k: np.asarray(v) for k, v in machine(1, {"y": 2.0, "z": -4.0}).items()})
+    write_axes(tmp_path / "base.toml", models())
+    out = tmp_path / "found"
+    arguments = ["diagnose", str(tmp_path / "run.csv"), "--model", str(tmp_path / "base.toml"), "--out", str(out)]
+    assert main([*arguments, "--axis", "y", "--axis", "z"]) == 0
+    assert "coolant_degc (input) moves Z by −" in capsys.readouterr().out
+    written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert [(one["axis"], one["kind"], one["channel"]) for one in written["effects"]] == [
+        ("y", "input", "coolant_degc"),
+        ("z", "input", "coolant_degc"),
+    ]
+    assert {one["axis"] for one in written["machine"][0]["axes"]} == {"y", "z"}
+    assert (out / "series-z.csv").read_text(encoding="utf-8").splitlines()[0].startswith("run,t_s,z_um")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Axis Z" in page and "What each effect moves" in page
+    assert list(load_axes(out / "model.toml")) == ["y", "z"]
+    [listed] = pages_in(out)
+    assert listed.verdict.startswith("coolant_degc (input) moves Z by −") and listed.tone == "good"
