@@ -24,13 +24,13 @@ def page_of_axes(pages: Mapping[str, Page], verdict: str = "", blocks: Sequence[
         Blocks above the sections of the axes.
     """
     verdicts = " ".join(f"{label_of(axis)}: {page.verdict}" for axis, page in pages.items())
-    data = dict.fromkeys(name for page in pages.values() for name in page.data.split(", ") if name)
+    data = dict.fromkeys(name for page in pages.values() for name in page.data)
     return Page(
         title=next(iter(pages.values())).title,
         verdict=verdict or verdicts,
         blocks=[*blocks, *(_section(axis, page, bool(verdict)) for axis, page in pages.items())],
         tone=worst(page.tone or "good" for page in pages.values()),
-        data=", ".join(data),
+        data=tuple(data),
     )
 
 
