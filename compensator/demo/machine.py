@@ -22,7 +22,7 @@ from sim_hardware.wire import (
 MACHINES = {"conduction": QuillMachine, "published": PublishedQuill}
 POLL_INTERVAL_S = 10.0
 #: Devices answer in real time, while the day is simulated: a computer that is busy for a moment loses no reading.
-TIMEOUT_S = 3.0
+TIMEOUT_S = 2.0
 PROBE_RANGE_UM = 500.0
 #: Standard deviation of one value of the touch probe, µm.
 TOUCH_STD_UM = 1.5
