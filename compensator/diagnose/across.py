@@ -25,6 +25,8 @@ from compensator.model.effects.hypothesis import Place
 
 #: An axis shows an effect if it moves it by at least so many standard errors.
 SEEN = 4.0
+#: An axis does not show an effect if it moves it surely, by two standard errors, less than this share of the largest.
+LITTLE = 0.5
 #: Kinds that no channel and no path shows, by what is said of them.
 _UNCAUSED = {"drift": "a drift", "step": "a step", "periodic": "an oscillation", "unobserved": "an unobserved source"}
 
@@ -81,9 +83,17 @@ class MachineEffect:
         return tuple(share for share in self.shares if share.is_seen)
 
     @property
+    def still(self) -> tuple[Share, ...]:
+        """The axes that it moves little at most; of the others the data do not say it."""
+        largest = max(abs(share.moves_um) for share in self.seen) if self.seen else 0.0
+        others = (share for share in self.shares if not share.is_seen)
+        return tuple(share for share in others if abs(share.moves_um) + 2.0 * share.std_um < LITTLE * largest)
+
+    @property
     def suspect(self) -> str:
-        """The axis whose probe is suspected first: the only one of several that shows the effect; empty otherwise."""
-        return self.seen[0].axis if len(self.seen) == 1 and len(self.shares) > 1 else ""
+        """The axis whose probe is suspected first: the only one that shows the effect, if the others surely do not."""
+        alone = len(self.seen) == 1 and len(self.still) == len(self.shares) - 1 > 0
+        return self.seen[0].axis if alone else ""
 
     @property
     def sentence(self) -> str:
@@ -92,15 +102,19 @@ class MachineEffect:
         cause = _UNCAUSED.get(kind, f"{channel or path} ({kind}{f', {path}' if path and channel else ''})")
         moved = ", ".join(f"{label_of(one.axis)} by {_size(one.moves_um)}" for one in self.seen)
         others = [one for one in self.shares if not one.is_seen]
-        still = ", ".join(f"{label_of(one.axis)} not ({abs(one.moves_um):.1f} ± {one.std_um:.1f})" for one in others)
+        words = {share.axis: "not" for share in self.still}
+        still = ", ".join(
+            f"{label_of(one.axis)} {words.get(one.axis, 'perhaps')} ({abs(one.moves_um):.1f} ± {one.std_um:.1f})"
+            for one in others
+        )
         cause = cause if channel or path else f"{cause[0].upper()}{cause[1:]}"
-        words = f"{cause} moves {moved} µm{f', {still}' if still else ''}."
+        sentence = f"{cause} moves {moved} µm{f', {still}' if still else ''}."
         if not self.suspect:
-            return words
+            return sentence
         beside = f" {label_of(self.partner)}, of the same direction, does not." if self.partner else ""
         probe = label_of(self.suspect)
         check = f"Check the probe of {probe} first: its mount, zero, scale and cable."
-        return f"{words} Only {probe} shows it.{beside} {check}"
+        return f"{sentence} Only {probe} shows it.{beside} {check}"
 
 
 def missing_places(diagnoses: Mapping[str, Diagnosis]) -> dict[str, frozenset[Place]]:

@@ -10,6 +10,7 @@ import compensator as tc
 from compensator.cli import main
 from compensator.data.axes import of_axis
 from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose.across import MachineEffect, Share
 from compensator.diagnose.criterion import MARGIN, Criterion
 from compensator.diagnose.evidence import evidence_of
 from compensator.model.effects.hypothesis import proposals
@@ -51,6 +52,17 @@ def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
     [effect] = found.machine
     assert effect.place[0] == "step" and effect.suspect == "z"
     assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
+
+
+def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():
+    alone, sure, open_ = (
+        Share(axis=axis, moves_um=moves, std_um=std, named=axis == "z")
+        for axis, moves, std in (("z", 20.0, 1.0), ("y", 0.5, 0.4), ("x", 6.0, 4.0))
+    )
+    clear, unclear = (MachineEffect(place=PLACE, shares=(alone, other)) for other in (sure, open_))
+    assert clear.suspect == "z" and "Y not (0.5 ± 0.4). Only Z shows it." in clear.sentence
+    assert not unclear.suspect and unclear.sentence.endswith("X perhaps (6.0 ± 4.0).")
+    assert not MachineEffect(place=PLACE, shares=(alone,)).suspect, "nothing to compare with"
 
 
 def test_y_alone_is_diagnosed_as_without_the_other_axes():
