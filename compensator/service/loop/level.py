@@ -3,8 +3,9 @@
 A candidate is judged by changes of Y. Where an effect began after the zero its level is not known: the candidate counts
 its channel from the zero, when the effect did not act. Measured Y shows it if nothing else can have moved Y. Until some
 time the present model was right about this zero, and about changes more so than the candidate: the effect did not act
-yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. Since then what the
-candidate leaves neither grows nor shrinks, as it would with a mount that creeps.
+yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. While the two are
+compared what the candidate leaves neither grows nor shrinks, as it would with a mount that creeps; before that the
+effect may still have grown to its full size.
 """
 
 from __future__ import annotations
@@ -68,18 +69,22 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
         self.blocks, self.count, self.sum_um = [], 0, 0.0
 
 
-def level_um(present: Sequence[tuple[int, float]], other: Sequence[tuple[int, float]]) -> float | None:
+def level_um(
+    present: Sequence[tuple[int, float]], other: Sequence[tuple[int, float]], *, since_ns: int = 0
+) -> float | None:
     """Return the level of another model that measured Y shows; None if it shows none.
 
     Parameters
     ----------
     present, other : sequence of (int, float)
         Number and mean of each block of the residuals of the present and the other model, µm, about the last zero.
+    since_ns : int
+        Since when the two are compared, ns since 1970 UTC.
 
     Returns
     -------
     float or None
-        Median of the other model's residual since the present one began to err, µm.
+        Median of the other model's residual since the present one began to err and they are compared, µm.
 
     Examples
     --------
@@ -100,7 +105,10 @@ def level_um(present: Sequence[tuple[int, float]], other: Sequence[tuple[int, fl
     if at_s is None:
         return None
     since = numbers >= round(at_s / (60.0 * BLOCK_MIN))
-    left_um, error_um = rest[since], _rms(own[since])
+    compared = since & (numbers * BLOCK_NS >= since_ns)
+    if np.sum(compared) < FEWEST:
+        return None
+    left_um, error_um = rest[compared], _rms(own[compared])
     was_right = _rms(own[~since]) < WAS_RIGHT * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
     # Medians: while the effect begins, its lag is seen.
     middle_um = float(np.median(left_um))

@@ -22,7 +22,7 @@ from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop, exchange_note
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.loop import role_of
+from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.shadow import Shadow

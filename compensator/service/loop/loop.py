@@ -20,24 +20,26 @@ from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
-from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
+from compensator.service.loop.avoided import avoid, avoid_after_back
 from compensator.service.loop.level import ErrorBlocks, level_um
-from compensator.service.loop.place import ADOPTION_H, has_to_wait, leads
-from compensator.service.loop.proof import is_better_about_zero, is_clearly_better, is_enough, is_limited
+from compensator.service.loop.place import ADOPTION_H, is_leading, remembered_h, role_of, takes_over, why_nothing
+from compensator.service.loop.proof import (
+    BETTER_PART,
+    LEVEL_PART,
+    is_better_about_zero,
+    is_clearly_better,
+    is_enough,
+    is_limited,
+)
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
+from compensator.service.loop.state import RULE, Compared, Exchange, LoopState, fresh, is_first_rule
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN, Comparison
 from compensator.service.transfer.second_opinion import described, is_unusable
 
-#: A candidate with the effects of the present model must differ from it by so many standard deviations.
-DIFFERS = 4.0
-#: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
-#: is diagnosed. A candidate that is better so far has as long before the next diagnosis.
-_REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
 _HOUR_NS = 3600 * NS
@@ -72,9 +74,9 @@ class Loop:
     ) -> None:
         self._settings = settings
         self._period_s = period_s
-        self.state = state if state is not None else LoopState(effects=list(effects))
+        self.state = state if state is not None else LoopState(effects=list(effects), rule=RULE)
         self.state.effects = list(effects)
-        self._comparison = Comparison(period_s, self.state.comparison)
+        self._comparison = self._compared()
 
     @property
     def wanted(self) -> StartDiagnosis | None:
@@ -90,8 +92,8 @@ class Loop:
         return self._comparison.judged_h
 
     @property
-    def _remembered_h(self) -> float:
-        return max(_REMEMBERED * self._settings.shadow_h, _REMEMBERED_H)
+    def _is_first_rule(self) -> bool:
+        return is_first_rule(self.state)
 
     # ------------------------------------------------------------------ one sample
 
@@ -143,7 +145,8 @@ class Loop:
         if not found.add(present, other, suspected=False):
             return False
         is_candidate = state.shadow is not None and state.shadow.role == "candidate"
-        hours = max(self._settings.record_h, self._remembered_h) if is_candidate else self._remembered_h
+        hours = remembered_h(self._settings)
+        hours = max(self._settings.record_h, hours) if is_candidate else hours
         oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
         found.forget_before(oldest_ns, 2 * self._settings.probes)
         state.verdict = found.verdict(deviations=self._settings.deviations)
@@ -151,7 +154,10 @@ class Loop:
 
     def _begin_comparison(self) -> None:
         self.state.comparison, self.state.verdict = fresh()
-        self._comparison = Comparison(self._period_s, self.state.comparison)
+        self._comparison = self._compared()
+
+    def _compared(self) -> Comparison:
+        return Comparison(self._period_s, self.state.comparison, by_likelihood=not self._is_first_rule)
 
     # ------------------------------------------------------------------ decisions about the shadow
 
@@ -173,6 +179,8 @@ class Loop:
         is_better = is_clearly_better(state.verdict) and is_enough(
             state.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
         )
+        if is_better and state.comparison.model_ns:
+            is_better = self._comparison.is_itself_better()
         if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
             state.phase = "shadow"
             return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
@@ -182,17 +190,21 @@ class Loop:
 
     def _shown_level_um(self) -> float | None:
         """Return the level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
-        return level_um(self.state.error.blocks, self.state.other_error.blocks)
+        shadow, since_ns = self.state.shadow, 0
+        if shadow is not None and not self._is_first_rule:
+            since_ns = shadow.since_utc_ns
+        return level_um(self.state.error.blocks, self.state.other_error.blocks, since_ns=since_ns)
 
     def _level_um(self) -> float | None:
         """Return by how much a candidate's level is raised at its adoption, µm; None if its level is not known.
 
-        Where measured Y does not show it, the candidate must be better about the zero, too: a level that contradicts
-        measured Y counts from a zero that was set before its effect acted, or measured Y has moved; which of them is
-        seen at the next zero.
+        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
+        that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
+        which of them is seen at the next zero.
         """
         shown_um, verdict = self._shown_level_um(), self.state.verdict
-        if shown_um is None and is_better_about_zero(verdict):
+        is_simple = self._is_first_rule or verdict.measured_by == "probe"
+        if shown_um is None and is_better_about_zero(verdict, BETTER_PART if is_simple else LEVEL_PART):
             return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um
 
@@ -267,18 +279,11 @@ class Loop:
         """Begin a diagnosis if it is time, and nothing speaks against it."""
         state = self.state
         planned_ns = pass_planned(state, self._settings, now_ns)
-        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN or self._is_leading(now_ns):
+        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
+            return []
+        if self._is_first_rule and is_leading(state, self._settings, now_ns):
             return []
         return begin_if_due(state, self._settings, now_ns, planned_ns)
-
-    def _is_leading(self, now_ns: int) -> bool:
-        """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
-        shadow = self.state.shadow
-        if shadow is None or shadow.role != "candidate":
-            return False
-        return now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS and leads(
-            self.state.verdict, self._settings
-        )
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
@@ -286,7 +291,7 @@ class Loop:
         running, state.diagnosis = state.diagnosis, None
         if running is None:
             return []
-        why = self._why_nothing(found, now_ns)
+        why = why_nothing(state, self._settings, found, now_ns)
         if why:
             data = LoopData(
                 step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256
@@ -303,21 +308,6 @@ class Loop:
         data = LoopData(step=LoopAction.SHADOW, role=role, model_sha256=found.candidate_sha256, effects=found.effects)
         return [Note(EventKind.LOOP, text, data.table())]
 
-    def _why_nothing(self, found: DiagnosisData, now_ns: int) -> str:
-        """Return why no candidate follows from a diagnosis; empty if one does."""
-        if found.refused:
-            return "refused"
-        if not found.candidate_sha256:
-            return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
-        if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
-            return "unchanged"
-        if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
-            return "in_shadow"
-        if not found.calibrated and is_avoided(self.state, found.effects, now_ns):
-            return "avoided"
-        waits = has_to_wait(self.state, self._settings, now_ns, same_effects=found.same_effects)
-        return "waits" if waits else ""
-
     # ------------------------------------------------------------------ between two samples
 
     def shadow_begins(
@@ -330,13 +320,16 @@ class Loop:
         error: ErrorBlocks | None = None,
     ) -> None:
         """Begin to compare another model, whose error on the record is given where it is known."""
-        state = self.state
+        state, goes_on = self.state, takes_over(self.state, role, effects)
         state.other_error = error if error is not None else ErrorBlocks()
         state.diagnosis = None
         state.phase = "shadow" if role == "candidate" else "watching"
         state.shadow = Compared(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
         state.exchange = ""
-        self._begin_comparison()
+        if goes_on:
+            self._comparison.go_on_with(now_ns)
+        else:
+            self._begin_comparison()
 
     def exchanged(self, now_ns: int, sha256_before: str) -> None:
         """Go on after the shadow has replaced the present model, whose hash was `sha256_before`."""
@@ -401,7 +394,7 @@ class Loop:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
         return begin_again(self.state)
 
-
-def role_of(found: DiagnosisData) -> Role:
-    """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
-    return "before" if found.calibrated else "candidate"
+    def decide_by_present_rule(self) -> None:
+        """Go on with the rule of this version; a state from a recording has that of the version that recorded it."""
+        self.state.rule = RULE
+        self._comparison = self._compared()

@@ -1,21 +1,77 @@
-"""Who has the place of the shadow after an adoption: the model before, until it is no longer needed.
+"""Who has the place of the shadow: whether what a diagnosis finds gets it.
 
-A candidate that took it at once would end the comparison by which the service goes back.
+A candidate gives it to that of a later diagnosis, which knows more. The model before an adoption keeps it until it is
+no longer needed: a candidate that took it at once would end the comparison by which the service goes back.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART
-from compensator.service.loop.state import LoopState
+from compensator.service.loop.shadow import Role
+from compensator.service.loop.state import LoopState, is_first_rule
 
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
 #: A model is better so far if it has shown this part of the deviations that it must show.
 LEADS = 0.5
+#: A candidate with the effects of the present model must differ from it by so many standard deviations.
+DIFFERS = 4.0
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
+#: is diagnosed. By the first rule a candidate that is better so far has as long to show the rest.
+_REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 _HOUR_NS = 3600 * NS
+
+
+def remembered_h(settings: LoopSettings) -> float:
+    """Return for how long what is compared counts, h."""
+    return max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
+
+
+def role_of(found: DiagnosisData) -> Role:
+    """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
+    return "before" if found.calibrated else "candidate"
+
+
+def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, now_ns: int) -> str:
+    """Return why no candidate follows from a diagnosis; empty if one does."""
+    shadow, role = state.shadow, role_of(found)
+    if found.refused:
+        return "refused"
+    if not found.candidate_sha256:
+        return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
+    if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
+        return "unchanged"
+    if found.in_shadow and shadow is not None and shadow.role == role:
+        return "in_shadow"
+    if not found.calibrated and is_avoided(state, found.effects, now_ns):
+        return "avoided"
+    if takes_over(state, role, found.effects):
+        assert shadow is not None
+        # What gave its place too often would never be compared for its own hours.
+        return "in_shadow" if now_ns - shadow.since_utc_ns < settings.shadow_h * _HOUR_NS else ""
+    return "waits" if has_to_wait(state, settings, now_ns, same_effects=found.same_effects) else ""
+
+
+def takes_over(state: LoopState, role: Role, effects: Sequence[str]) -> bool:
+    """Return whether a candidate has the effects of the one in shadow: then the comparison goes on with it."""
+    shadow = state.shadow
+    if is_first_rule(state) or shadow is None or role != "candidate" or shadow.role != role:
+        return False
+    return not state.exchange and sorted(shadow.effects) == sorted(effects)
+
+
+def is_leading(state: LoopState, settings: LoopSettings, now_ns: int) -> bool:
+    """Return whether a candidate is better so far: by the first rule it gets time to show it before a diagnosis."""
+    if state.shadow is None or state.shadow.role != "candidate":
+        return False
+    is_new = now_ns - state.shadow.since_utc_ns < remembered_h(settings) * _HOUR_NS
+    return is_new and leads(state.verdict, settings)
 
 
 def leads(found: ComparisonData, settings: LoopSettings) -> bool:

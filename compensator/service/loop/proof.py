@@ -9,6 +9,9 @@ from compensator.service.outcome import Outcome
 
 #: A candidate must be wrong by less than this part of what the present model is wrong by.
 BETTER_PART = 0.95
+#: A candidate whose level nothing else shows must be wrong by less than this part about the zero of a displacement
+#: sensor: a level of its own that is as wrong as the present one's gives a few percent by chance. Probes correct both.
+LEVEL_PART = 0.8
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
@@ -28,11 +31,11 @@ def is_clearly_better(found: ComparisonData) -> bool:
     return found.ratio is not None and found.ratio <= BETTER_PART
 
 
-def is_better_about_zero(found: ComparisonData) -> bool:
+def is_better_about_zero(found: ComparisonData, part: float = BETTER_PART) -> bool:
     """Return whether the candidate is better about the zero, too: its level does not contradict measured Y."""
     if found.present_rms_um is None or found.candidate_rms_um is None:
         return False
-    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
+    return found.candidate_rms_um <= part * found.present_rms_um
 
 
 def is_limited(outcome: Outcome) -> bool:

@@ -20,7 +20,7 @@ from compensator.messages import Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of, slowest_min
 from compensator.service.loop.core import ModelLoop, exchange_note, is_rest, warmed_on
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.loop import role_of
+from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP

@@ -20,7 +20,6 @@ from compensator.events import DiagnosisData
 from compensator.model.effects import Effect
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, model_of
-from compensator.service.loop.loop import DIFFERS
 
 #: Verdict of a diagnosis that ended without a result.
 FAILED = "failed"
@@ -92,10 +91,7 @@ def weigh(
     except CompensatorError as error:
         return Weighed(replace(plain, refused=str(error)), None)
     same, change = difference(model, present)
-    in_shadow = False
-    if shadow is not None:
-        alike, other_change = difference(model, shadow)
-        in_shadow = model.sha256 == shadow.sha256 or (alike and other_change < DIFFERS)
+    in_shadow = shadow is not None and model.sha256 == shadow.sha256
     effects = effect_names(model)
     if same and model.sha256 == base.sha256:
         change = 0.0
@@ -138,7 +134,8 @@ def name_of(effect: Effect) -> str:
 def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
     """Return whether two models have the same effects, and by how many standard deviations their parameters differ.
 
-    Of the parameters that have a standard error in both; infinite where an effect has none and the parameters differ.
+    In standard errors of the first model, which was found later: it was found on more of the effect, and says whether
+    the parameters of the other one are still possible. Infinite where an effect has none and the parameters differ.
     """
     own, others = ({name_of(effect): effect for effect in one.effects} for one in (model, other))
     if own.keys() != others.keys():
@@ -149,13 +146,12 @@ def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
 def _change(effect: Effect, other: Effect) -> float:
     """Return by how many standard deviations the parameter of an effect that differs most does."""
     tables, largest, compared = (effect.to_table(), other.to_table()), 0.0, False
-    for name in effect.std.keys() & other.std.keys():
+    for name in effect.std:
         values = [_numbers(table.get(name)) for table in tables]
-        errors = [_numbers(one.std[name]) for one in (effect, other)]
-        if not values[0] or len({len(each) for each in (*values, *errors)}) > 1:
+        errors = _numbers(effect.std[name])
+        if not values[0] or len({len(each) for each in (*values, errors)}) > 1:
             continue
-        for a, b, e, f in zip(*values, *errors, strict=True):
-            std = math.hypot(e, f)
+        for a, b, std in zip(*values, errors, strict=True):
             largest, compared = max(largest, abs(a - b) / std if std > 0.0 else 0.0), True
     if compared:
         return largest

@@ -23,6 +23,8 @@ from compensator.service.transfer.evidence import evidence, followed
 
 #: From this number of standard deviations of the difference on a model is better or worse.
 DEVIATIONS = 4.0
+#: A model that refutes the other one must be better than one that is neither better nor worse by this part of them.
+SURE_PART = 0.5
 #: A model whose changes are wrong by more than the present one's by less than this part is not worse.
 WORSE_PART = 0.05
 #: Fewer changes of block means, or probes, do not judge a model.
@@ -83,6 +85,9 @@ class ComparisonState(msgspec.Struct, kw_only=True):
         Samples with measured Y while a sensor was suspected; steps of Y, and those of them without any change.
     y_um : float, optional
         The last measured Y.
+    model_ns : int
+        Since when the other model has been compared, ns since 1970 UTC; 0: all the time. Before it was another one
+        with the same effects.
     """
 
     zeros: int = 0
@@ -96,6 +101,7 @@ class ComparisonState(msgspec.Struct, kw_only=True):
     steps: int = 0
     still: int = 0
     y_um: float | None = None
+    model_ns: int = 0
 
 
 class Comparison:
@@ -107,9 +113,12 @@ class Comparison:
         Length of a sample, s.
     state : ComparisonState, optional
         What was compared before.
+    by_likelihood : bool
+        Whether the deviations are those of the likelihood (`evidence`).
     """
 
-    def __init__(self, period_s: float, state: ComparisonState | None = None) -> None:
+    def __init__(self, period_s: float, state: ComparisonState | None = None, *, by_likelihood: bool = False) -> None:
+        self._by_likelihood = by_likelihood
         self._fewest = _MEASURED * BLOCK_MIN * 60.0 / period_s
         self.state = state if state is not None else ComparisonState()
 
@@ -147,6 +156,14 @@ class Comparison:
         """Begin a new block: Y before and after a zero are not comparable."""
         self._close()
         self.state.zeros += 1
+
+    def go_on_with(self, time_utc_ns: int) -> None:
+        """Compare another model with the same effects from now on: what the one before has shown counts for it.
+
+        It was found later, so each value is judged by a model that did not know it.
+        """
+        self.set_zero()
+        self.state.model_ns = time_utc_ns
 
     def forget_before(self, time_utc_ns: int, keep_probes: int) -> None:
         """Forget what is older than a time, but for the last probes."""
@@ -186,6 +203,15 @@ class Comparison:
         chosen = by_sensor if by_sensor.why is None or not self.state.probes else self._by_probes(deviations)
         hours = (self.state.last_ns - self.state.first_ns) / (3600 * NS)
         return changed(chosen, hours=hours)
+
+    def is_itself_better(self) -> bool:
+        """Return whether the other model is the better one since it has been compared, however clearly."""
+        blocks = [block for block in self.state.blocks if block.number * BLOCK_NS >= self.state.model_ns]
+        own, other, _ = _changes(blocks)
+        if own.size < FEWEST:
+            probes = [probe for probe in self.state.probes if probe.time_utc_ns >= self.state.model_ns]
+            own, other = np.array([(probe.own_um, probe.other_um) for probe in probes]).reshape(-1, 2).T
+        return own.size >= FEWEST and evidence(own, own - other).likelihood > 0.0
 
     # ------------------------------------------------------------------ blocks
 
@@ -239,7 +265,7 @@ class Comparison:
         kept = followed(moves, own, own - other, parts=own.size // FEWEST, deviations=deviations)
         if np.sum(kept) < FEWEST:
             return changed(scores, why=NotJudged.UNRELATED)
-        return _judged(scores, own[kept], own[kept] - other[kept], deviations)
+        return self._judged(scores, own[kept], own[kept] - other[kept], deviations)
 
     def _by_probes(self, deviations: float) -> ComparisonData:
         own, other = np.array([(probe.own_um, probe.other_um) for probe in self.state.probes]).T
@@ -253,7 +279,22 @@ class Comparison:
         if own.size < FEWEST:
             return changed(scores, why=NotJudged.TOO_LITTLE)
         # Each model has been corrected by the probes before: what a probe shows beyond that is a change already.
-        return _judged(scores, own, own - other, deviations)
+        return self._judged(scores, own, own - other, deviations)
+
+    def _judged(self, scores: ComparisonData, own: Vector, difference: Vector, deviations: float) -> ComparisonData:
+        weighed = evidence(own, difference)
+        shown = weighed.likelihood if self._by_likelihood else weighed.deviations
+        # What refutes the present model may still be no better than it: by half as many deviations it must be.
+        also = SURE_PART * deviations if self._by_likelihood else deviations
+        assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
+        verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
+        if shown >= deviations and weighed.deviations >= also and weighed.ratio < 1.0:
+            verdict = ComparisonVerdict.BETTER
+        elif shown <= -deviations and weighed.deviations <= -also and weighed.ratio > 1.0 + WORSE_PART:
+            verdict = ComparisonVerdict.WORSE
+        y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
+        scores = changed(scores, verdict=verdict, y_moved=y_moved, ratio=weighed.ratio)
+        return changed(scores, deviations=shown, effective=weighed.effective)
 
 
 def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:
@@ -289,19 +330,6 @@ def _changes(blocks: list[Block]) -> tuple[Vector, Vector, Vector]:
         before = block
     own, other, y = np.array(rows).reshape(-1, 3).T
     return own, other, y
-
-
-def _judged(scores: ComparisonData, own: Vector, difference: Vector, deviations: float) -> ComparisonData:
-    weighed = evidence(own, difference)
-    assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
-    verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
-    if weighed.deviations >= deviations and weighed.ratio < 1.0:
-        verdict = ComparisonVerdict.BETTER
-    elif weighed.deviations <= -deviations and weighed.ratio > 1.0 + WORSE_PART:
-        verdict = ComparisonVerdict.WORSE
-    y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
-    scores = changed(scores, verdict=verdict, y_moved=y_moved, ratio=weighed.ratio)
-    return changed(scores, deviations=weighed.deviations, effective=weighed.effective)
 
 
 def _rms(values: Vector) -> float:

@@ -5,17 +5,26 @@ With the residual r of the present model and the difference g of the two predict
     Δr = a + β Δg + u
 
 β = 0: measured Y moves as the present model predicts; β = 1: as the other one. The mean squares of the two residuals
-differ by the sum of g² (1 − 2 β), so the other model is better by (β − ½) / σ(β) standard deviations.
+differ by the sum of g² (1 − 2 β), so the other model is the better one from β = ½ on.
+
+Two measures of it, each as a number of standard deviations:
+
+- `deviations`: (β − ½) / σ(β), against a model that is neither better nor worse;
+- `likelihood`: √(2 log L), with L the likelihood of β = 1 over that of β = 0. If the present model is right, L has the
+  expectation 1 however long and often one looks, so L ever exceeds e⁸, four deviations, in at most one of 3,000
+  comparisons (Ville). A candidate that is right shows as much on a quarter of the values: its β is compared with 0, and
+  not with ½. One that is as wrong as the present model may show it by chance, which the first measure tells.
 
 Changes, not values: a sensor that was moved, or that creeps, shifts the values for hours, but it is one large change,
 which is given little weight (Huber), or the constant a.
 
 σ(β) counts effective values: consecutive products u Δg that resemble each other, with correlation ρ, count for
 (1 − ρ) / (1 + ρ) each. The scale of u comes from the same n values, so the quotient is Student's t with n − 2 degrees
-of freedom; it is stated as the normal deviation of the same probability: few values show less than they seem to.
+of freedom; it is stated as the normal deviation of the same probability: few values show less than they seem to. L is
+the ratio of two densities of that distribution.
 
 Source: Huber, Robust Statistics (1981), section 7; Bartlett (1946) for the effective number; Wallace, Ann. Math.
-Statist. 30 (1959) for Student's t.
+Statist. 30 (1959) for Student's t; Ville (1939), and Shafer, J. R. Statist. Soc. A 184 (2021), for betting on a model.
 """
 
 from __future__ import annotations
@@ -50,11 +59,15 @@ class Evidence:
         Number of independent values.
     ratio : float
         Root mean square of the changes of the other model's residual over that of the present one's, by the weights.
+    likelihood : float
+        √(2 log L) of the likelihood ratio L of the other model and the present one; negative if the present one is
+        more likely.
     """
 
     deviations: float
     effective: float
     ratio: float = 1.0
+    likelihood: float = 0.0
 
 
 def evidence(residual_um: Vector, difference_um: Vector) -> Evidence:
@@ -98,8 +111,9 @@ def evidence(residual_um: Vector, difference_um: Vector) -> Evidence:
     own, other = (
         float(np.sum(weights * part**2)) + n * FLOOR_UM**2 for part in (residual_um, residual_um - difference_um)
     )
-    quotient = (beta - 0.5) / math.sqrt(variance / square * n / effective)
-    return Evidence(_normal(quotient, n - 2), effective, math.sqrt(other / own))
+    std = math.sqrt(variance / square * n / effective)
+    deviations, likelihood = _normal((beta - 0.5) / std, n - 2), _likelihood(beta, std, n - 2)
+    return Evidence(deviations, effective, math.sqrt(other / own), likelihood)
 
 
 def _normal(t: float, freedom: int) -> float:
@@ -112,6 +126,19 @@ def _normal(t: float, freedom: int) -> float:
     """
     size = math.sqrt(freedom * math.log1p(t * t / freedom)) * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)
     return math.copysign(size, t)
+
+
+def _likelihood(beta: float, std: float, freedom: int) -> float:
+    """Return √(2 log L) for the likelihoods of 1 and 0 at an estimate with Student's t.
+
+    Examples
+    --------
+    >>> [round(_likelihood(*found), 2) for found in ((1.0, 0.25, 10_000), (0.5, 0.01, 8), (1.0, 0.25, 8))]
+    [4.0, 0.0, 3.14]
+    """
+    against, with_it = (math.log1p((beta - value) ** 2 / (std**2 * freedom)) for value in (0.0, 1.0))
+    doubled = (freedom + 1.0) * (against - with_it)
+    return math.copysign(math.sqrt(abs(doubled)), doubled)
 
 
 def _independent(products: Vector) -> float:

@@ -1,0 +1,112 @@
+"""By which rule a candidate is judged: the newest one bets for its effects; recordings keep their own rule."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.recording.reading import recordings
+from compensator.service.loop import loop as loop_module
+from compensator.service.loop.core import LOOP_STATE
+from compensator.service.loop.run import LoopRun
+from compensator.service.loop.state import RULE, LoopState, decode_loop
+from compensator.service.replay import opening_of
+from compensator.service.transfer.comparison import SURE_PART
+from compensator.service.transfer.evidence import evidence
+from compensator.service.transfer.model_store import sha256_of
+from tests.service.living import MACHINE
+from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
+from tests.service.test_loop_service import Looping, checked
+from tests.service.test_loop_watch import watching
+from tests.service.test_restart import QUILL
+
+SHORT = {"loop": {"policy": "adopt", "every_h": 8, "at_utc": "02:00", "shadow_h": 6.0}}
+#: So noisy that eight hours show nothing yet.
+NOISY_UM = 3.0
+
+
+def first_looks(beta: float, noise: float, *, trials: int, seed: int, count: int = 72) -> np.ndarray:
+    """Return after how many changes four deviations are first shown, by both measures; infinite if never."""
+    rng, found = np.random.default_rng(seed), np.full((trials, 2), np.inf)
+    for shown_at in found:
+        moves, error = rng.normal(size=count), noise * rng.normal(size=count)
+        for n in range(8, count + 1, 2):
+            weighed = evidence(beta * moves[:n] + error[:n], moves[:n])
+            reached = np.array([weighed.deviations, weighed.likelihood]) >= 4.0
+            shown_at[reached & np.isinf(shown_at)] = n
+    return found
+
+
+def test_a_right_candidate_shows_itself_earlier_and_a_right_present_model_is_hardly_ever_refuted() -> None:
+    by_deviations, by_likelihood = np.median(first_looks(1.0, 1.2, trials=20, seed=3), axis=0)
+    assert by_likelihood < 0.6 * by_deviations
+    # Looked at again and again; the candidate is nothing to do with Y.
+    assert not np.isfinite(first_looks(0.0, 1.2, trials=100, seed=4)).any()
+
+
+def test_a_candidate_that_is_neither_better_nor_worse_is_refused_more_often_than_by_likelihood_alone() -> None:
+    rng, alone, both = np.random.default_rng(6), 0, 0
+    for _ in range(60):
+        moves = rng.normal(size=48)
+        weighed = evidence(0.5 * moves + 1.2 * rng.normal(size=48), moves)
+        alone += abs(weighed.likelihood) >= 3.0
+        both += abs(weighed.likelihood) >= 3.0 and abs(weighed.deviations) >= 3.0 * SURE_PART
+    assert both <= 0.7 * alone
+
+
+def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> None:
+    night = Night(shown(extended(2.0)), shown(extended()))
+    loop = LoopRun(settings(**SHORT), QUILL, night)
+    steps = run(loop, machine(2 * DAY, noise_um=NOISY_UM))
+    found = [decision for decision in decisions(steps) if decision[1] in ("shadow", "adopt")]
+    assert [step for _, step, _ in found] == ["shadow", "shadow", "adopt"]
+    first, second, adopted = (seq for seq, _, _ in found)
+    # The newest one has been compared for its own six hours, and is what is adopted.
+    assert second - first == 8 * 60 and adopted - second >= 6 * 60 - 1
+    assert steps[-1].model_sha256 == sha256_of(extended())
+    (event,) = [note for step in steps for note in step.events if note.kind == "adopt"]
+    assert event.data["comparison"]["hours"] >= 13.5
+
+
+def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None:
+    loop = LoopRun(settings(**SHORT), QUILL, Night(shown(extended()), shown(extended(7.0))))
+    steps = run(loop, machine(DAY + 600, noise_um=NOISY_UM))
+    assert "adopt" not in [step for _, step, _ in decisions(steps)]
+
+
+def test_a_candidate_gives_its_place_to_other_effects_of_a_later_diagnosis_at_once() -> None:
+    leading = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
+    loop, now_ns = watching(3.0, leading, role="candidate")
+    found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
+    (note,) = loop.receive(found, now_ns)
+    assert note.data["step"] == "shadow"
+    loop.shadow_begins("b" * 64, found.effects, now_ns)
+    assert loop.state.verdict.verdict == "not_judged"  # what other effects have shown does not count for it
+
+
+async def test_a_recording_of_an_earlier_version_is_replayed_by_its_own_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its state has no number of a rule; the next start of the service goes on with the present one."""
+    machine = Looping(tmp_path, shown(extended()))
+    with monkeypatch.context() as earlier:
+        earlier.setattr(loop_module, "LoopState", partial(_of_first_rule, LoopState))
+        await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    before = len(recordings(machine.recordings, MACHINE))
+    await machine.run(30)
+    rules = [decode_loop(opening_of(path)[LOOP_STATE]).rule for path in recordings(machine.recordings, MACHINE)]
+    assert rules == [1] * before + [RULE]
+    checked(machine)
+
+
+def _of_first_rule(made: type[LoopState], *, effects: list[str], rule: int) -> LoopState:
+    assert rule == RULE
+    return made(effects=effects)
+
+
+def test_a_state_without_a_number_is_of_the_first_rule() -> None:
+    assert decode_loop(b"{}").rule == 1
