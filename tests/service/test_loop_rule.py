@@ -1,26 +1,15 @@
-"""By which rule a candidate is judged: the newest one bets for its effects; recordings keep their own rule."""
+"""By which rule a candidate is judged: the newest one bets for its effects."""
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
-from compensator.recording.reading import recordings
-from compensator.service.loop import loop as loop_module
-from compensator.service.loop.core import LOOP_STATE
 from compensator.service.loop.run import LoopRun
-from compensator.service.loop.state import RULE, LoopState, decode_loop
-from compensator.service.replay import opening_of
 from compensator.service.transfer.comparison import SURE_PART
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
-from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
-from tests.service.test_loop_service import Looping, checked
 from tests.service.test_loop_watch import watching
 from tests.service.test_restart import QUILL
 
@@ -86,27 +75,3 @@ def test_a_candidate_gives_its_place_to_other_effects_of_a_later_diagnosis_at_on
     assert note.data["step"] == "shadow"
     loop.shadow_begins("b" * 64, found.effects, now_ns)
     assert loop.state.verdict.verdict == "not_judged"  # what other effects have shown does not count for it
-
-
-async def test_a_recording_of_an_earlier_version_is_replayed_by_its_own_rule(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its state has no number of a rule; the next start of the service goes on with the present one."""
-    machine = Looping(tmp_path, shown(extended()))
-    with monkeypatch.context() as earlier:
-        earlier.setattr(loop_module, "LoopState", partial(_of_first_rule, LoopState))
-        await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
-    before = len(recordings(machine.recordings, MACHINE))
-    await machine.run(30)
-    rules = [decode_loop(opening_of(path)[LOOP_STATE]).rule for path in recordings(machine.recordings, MACHINE)]
-    assert rules == [1] * before + [RULE]
-    checked(machine)
-
-
-def _of_first_rule(made: type[LoopState], *, effects: list[str], rule: int) -> LoopState:
-    assert rule == RULE
-    return made(effects=effects)
-
-
-def test_a_state_without_a_number_is_of_the_first_rule() -> None:
-    assert decode_loop(b"{}").rule == 1

@@ -17,7 +17,7 @@ from compensator.service.loop import live
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import RULE, Compared, LoopState, Running
+from compensator.service.loop.state import Compared, LoopState, Running
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
@@ -58,13 +58,11 @@ def watching(
     *,
     since_h: float = 0.0,
     role: Role = "before",
-    rule: int = RULE,
 ) -> tuple[Loop, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
     since_ns = ADOPTED_NS + round(since_h * HOUR_NS)
     now_ns = since_ns + round(hours * HOUR_NS)
     state = LoopState(
-        rule=rule,
         phase="watching" if role == "before" else "shadow",
         shadow=Compared(sha256="a" * 64, effects=[], role=role, since_utc_ns=since_ns),
         adopted_utc_ns=ADOPTED_NS,

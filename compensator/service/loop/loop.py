@@ -22,7 +22,7 @@ from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back
 from compensator.service.loop.level import ErrorBlocks, level_um
-from compensator.service.loop.place import ADOPTION_H, is_leading, remembered_h, role_of, takes_over, why_nothing
+from compensator.service.loop.place import ADOPTION_H, remembered_h, role_of, takes_over, why_nothing
 from compensator.service.loop.proof import (
     BETTER_PART,
     LEVEL_PART,
@@ -33,7 +33,7 @@ from compensator.service.loop.proof import (
 )
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import RULE, Compared, Exchange, LoopState, fresh, is_first_rule
+from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
@@ -74,7 +74,7 @@ class Loop:
     ) -> None:
         self._settings = settings
         self._period_s = period_s
-        self.state = state if state is not None else LoopState(effects=list(effects), rule=RULE)
+        self.state = state if state is not None else LoopState(effects=list(effects))
         self.state.effects = list(effects)
         self._comparison = self._compared()
 
@@ -90,10 +90,6 @@ class Loop:
     def judged_h(self) -> float:
         """Time of the usable blocks of measured Y, h."""
         return self._comparison.judged_h
-
-    @property
-    def _is_first_rule(self) -> bool:
-        return is_first_rule(self.state)
 
     # ------------------------------------------------------------------ one sample
 
@@ -157,7 +153,7 @@ class Loop:
         self._comparison = self._compared()
 
     def _compared(self) -> Comparison:
-        return Comparison(self._period_s, self.state.comparison, by_likelihood=not self._is_first_rule)
+        return Comparison(self._period_s, self.state.comparison, by_likelihood=True)
 
     # ------------------------------------------------------------------ decisions about the shadow
 
@@ -190,9 +186,8 @@ class Loop:
 
     def _shown_level_um(self) -> float | None:
         """Return the level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
-        shadow, since_ns = self.state.shadow, 0
-        if shadow is not None and not self._is_first_rule:
-            since_ns = shadow.since_utc_ns
+        shadow = self.state.shadow
+        since_ns = shadow.since_utc_ns if shadow is not None else 0
         return level_um(self.state.error.blocks, self.state.other_error.blocks, since_ns=since_ns)
 
     def _level_um(self) -> float | None:
@@ -203,8 +198,8 @@ class Loop:
         which of them is seen at the next zero.
         """
         shown_um, verdict = self._shown_level_um(), self.state.verdict
-        is_simple = self._is_first_rule or verdict.measured_by == "probe"
-        if shown_um is None and is_better_about_zero(verdict, BETTER_PART if is_simple else LEVEL_PART):
+        part = BETTER_PART if verdict.measured_by == "probe" else LEVEL_PART
+        if shown_um is None and is_better_about_zero(verdict, part):
             return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um
 
@@ -280,8 +275,6 @@ class Loop:
         state = self.state
         planned_ns = pass_planned(state, self._settings, now_ns)
         if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
-            return []
-        if self._is_first_rule and is_leading(state, self._settings, now_ns):
             return []
         return begin_if_due(state, self._settings, now_ns, planned_ns)
 
@@ -393,8 +386,3 @@ class Loop:
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
         return begin_again(self.state)
-
-    def decide_by_present_rule(self) -> None:
-        """Go on with the rule of this version; a state from a recording has that of the version that recorded it."""
-        self.state.rule = RULE
-        self._comparison = self._compared()

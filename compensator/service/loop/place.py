@@ -14,7 +14,7 @@ from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, is_first_rule
+from compensator.service.loop.state import LoopState
 
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
@@ -23,7 +23,7 @@ LEADS = 0.5
 #: A candidate with the effects of the present model must differ from it by so many standard deviations.
 DIFFERS = 4.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
-#: is diagnosed. By the first rule a candidate that is better so far has as long to show the rest.
+#: is diagnosed.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 _HOUR_NS = 3600 * NS
 
@@ -61,17 +61,9 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
 def takes_over(state: LoopState, role: Role, effects: Sequence[str]) -> bool:
     """Return whether a candidate has the effects of the one in shadow: then the comparison goes on with it."""
     shadow = state.shadow
-    if is_first_rule(state) or shadow is None or role != "candidate" or shadow.role != role:
+    if shadow is None or role != "candidate" or shadow.role != role:
         return False
     return not state.exchange and sorted(shadow.effects) == sorted(effects)
-
-
-def is_leading(state: LoopState, settings: LoopSettings, now_ns: int) -> bool:
-    """Return whether a candidate is better so far: by the first rule it gets time to show it before a diagnosis."""
-    if state.shadow is None or state.shadow.role != "candidate":
-        return False
-    is_new = now_ns - state.shadow.since_utc_ns < remembered_h(settings) * _HOUR_NS
-    return is_new and leads(state.verdict, settings)
 
 
 def leads(found: ComparisonData, settings: LoopSettings) -> bool:

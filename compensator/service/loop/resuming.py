@@ -52,7 +52,6 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     if last is None:
         return ModelLoop(config, present.model, {})
     core = last.loop.core
-    core.loop.decide_by_present_rule()
     if last.config == loaded.data:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()

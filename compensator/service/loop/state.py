@@ -14,8 +14,6 @@ from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state; a state of another version is refused.
 STATE_SCHEMA = 1
-#: By which rule is decided: 1: the first one, of recordings without a number; 2: by likelihood.
-RULE = 2
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
@@ -81,8 +79,6 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         Errors of the present model and of the one in shadow since the last zero, on the record before it, too.
     avoided : list of Avoided
         Models that were gone back from or dismissed.
-    rule : int
-        Rule by which is decided; a replay decides by that of the recording.
     """
 
     schema: int = STATE_SCHEMA
@@ -102,12 +98,6 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     other_error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     avoided: list[Avoided] = []
-    rule: int = 1
-
-
-def is_first_rule(state: LoopState) -> bool:
-    """Return whether a state is of a recording that was decided by the first rule."""
-    return state.rule < RULE
 
 
 def fresh() -> tuple[ComparisonState, ComparisonData]:
