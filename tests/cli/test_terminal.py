@@ -109,7 +109,7 @@ def test_the_first_sentence_is_the_result_and_bold() -> None:
         (["watch", "--b"], {"--bind"}),
         (
             ["compare", "run.csv", "--"],
-            {"--model", "--page", "--from", "--out", "--column", "--json", "--debug", "--help"},
+            {"--model", "--page", "--from", "--out", "--column", "--axis", "--json", "--debug", "--help"},
         ),
     ],
 )
