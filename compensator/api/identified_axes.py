@@ -97,7 +97,7 @@ class IdentifiedAxes(PagedAxes[IdentificationResult]):
         return f"{'; '.join(words)}. Errors on held-out blocks of time, rms: {errors}."
 
     def _times(self, axis: str) -> str:
-        return " and ".join(f"{tau:.4g}" for tau in self.results[axis].calibration.deformation.main.taus_min)
+        return _names([f"{float(f'{tau:.3g}'):g}" for tau in self.results[axis].calibration.deformation.main.taus_min])
 
     def table(self) -> Table:
         """Return gains, time constants and errors, with a column for each axis."""
