@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from compensator.api.files import Paged
 from compensator.axes import label_of
 from compensator.display import Listing, Shown, Table, Words
+from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
@@ -59,3 +60,18 @@ class PagedAxes(AxisResults[_Result], Paged):
         from compensator.report.axes import page_of_axes
 
         return page_of_axes({axis: result.as_page() for axis, result in self.results.items()})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class AxisModels(PagedAxes[_Result]):
+    """Results of several axes that each have a model; one file holds them all."""
+
+    @property
+    def model(self) -> dict[str, ThermalModel]:
+        """The model of each axis, as read back from their file."""
+        return {axis: result.model for axis, result in self.results.items()}
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the model file."""
+        return str(next(iter(self.results.values())).sha256)

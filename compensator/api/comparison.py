@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 import os
@@ -14,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator.api.axis_results import PagedAxes
-from compensator.api.files import ModelLike, Paged, models_of
+from compensator.api.files import ModelLike, Paged, models_of, write_curves
 from compensator.arrays import Vector
-from compensator.atomic_write import atomic_write
 from compensator.axes import AxisWords
 from compensator.blas import one_thread
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
@@ -26,7 +24,7 @@ from compensator.data.screening import check_deformation_scale, screen_temperatu
 from compensator.display import Table
 from compensator.errors import DataError, ModelError, UsageError
 from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
-from compensator.model.simulation import Scores, csv_rows
+from compensator.model.simulation import Scores
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
@@ -113,9 +111,7 @@ class ComparisonResult(Paged):
         OSError
             If the file cannot be written.
         """
-        with atomic_write(Path(path)) as file:
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.columns))
-        return Path(path)
+        return write_curves(path, self.columns)
 
     @property
     def columns(self) -> dict[str, Vector]:
@@ -179,9 +175,7 @@ class ComparedAxes(PagedAxes[ComparisonResult]):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the columns of all axes as one CSV."""
         columns = {name: values for result in self.results.values() for name, values in result.columns.items()}
-        with atomic_write(Path(path)) as file:
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
-        return Path(path)
+        return write_curves(path, columns)
 
 
 def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import os
@@ -16,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator import __version__
-from compensator.api.axis_results import PagedAxes
-from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of
+from compensator.api.axis_results import AxisModels
+from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of, write_curves
 from compensator.arrays import Vector
-from compensator.atomic_write import atomic_write, require_folder
+from compensator.atomic_write import require_folder
 from compensator.axes import AxisWords, column_of, label_of
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
@@ -39,7 +38,7 @@ from compensator.identify.pairs import pairs
 from compensator.model.effects.hypothesis import Place
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_axes, write_model
-from compensator.model.simulation import csv_rows, require_channels
+from compensator.model.simulation import require_channels
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 
@@ -51,8 +50,58 @@ if TYPE_CHECKING:
 FILES = ("model.toml", "diagnosis.json", "report.html", "series.csv")
 
 
+class _DiagnosisFiles(Paged):
+    """A diagnosis with its files, of one axis or of several."""
+
+    __slots__ = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of `diagnosis.json`."""
+        raise NotImplementedError
+
+    def write_model_file(self, path: Path) -> None:
+        """Write the extended model."""
+        raise NotImplementedError
+
+    def write_series(self, path: Path) -> None:
+        """Write all curves as CSV."""
+        raise NotImplementedError
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
+
+        Parameters
+        ----------
+        path : path
+            A name that ends in .toml: the model file. Any other name: a folder for `model.toml`, `diagnosis.json`,
+            `report.html` and `series.csv` (all curves), which is created if it does not exist.
+
+        Raises
+        ------
+        UsageError
+            If the parent folder does not exist.
+        """
+        target = Path(path)
+        if target.suffix.lower() == ".toml":
+            self.write_model_file(target)
+        else:
+            require_folder(target)
+            self.save_all(target, series=True)
+        return target
+
+    def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
+        """Write model, `diagnosis.json`, page and, if wanted, curves into a folder; the page also to another file."""
+        folder.mkdir(parents=True, exist_ok=True)
+        model, found, page, curves = (folder / name for name in FILES)
+        self.write_model_file(model)
+        found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        self.write_page(page, also=also)
+        if series:
+            self.write_series(curves)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosisResult(Paged):
+class DiagnosisResult(_DiagnosisFiles):
     """Result of a diagnosis: what a model lacks.
 
     Parameters
@@ -98,43 +147,13 @@ class DiagnosisResult(Paged):
         """Return the content: verdict, errors, effects with their parameters, warnings."""
         return self.words(list(contents(self.diagnosis, self.remarks, self.free_run)))
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
-
-        Parameters
-        ----------
-        path : path
-            A name that ends in .toml: the model file. Any other name: a folder for `model.toml`, `diagnosis.json`,
-            `report.html` and `series.csv` (all curves), which is created if it does not exist.
-
-        Raises
-        ------
-        UsageError
-            If the parent folder does not exist.
-        """
-        target = Path(path)
-        if target.suffix.lower() == ".toml":
-            write_model(target, self.model)
-        else:
-            require_folder(target)
-            self.save_all(target, series=True)
-        return target
-
-    def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
-        """Write model, `diagnosis.json`, page and, if wanted, curves into a folder; the page also to another file."""
-        folder.mkdir(parents=True, exist_ok=True)
-        model, found, page, curves = (folder / name for name in FILES)
-        write_model(model, self.model)
-        found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        self.write_page(page, also=also)
-        if series:
-            self.write_series(curves)
+    def write_model_file(self, path: Path) -> None:
+        """Write the extended model."""
+        write_model(path, self.model)
 
     def write_series(self, path: Path) -> None:
         """Write all curves as CSV."""
-        with atomic_write(path) as file:
-            columns = self.words.table(series_of(self.diagnosis))
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
+        write_curves(path, self.words.table(series_of(self.diagnosis)))
 
     def as_page(self) -> Page:
         """Return the content of the page."""
@@ -153,7 +172,7 @@ class DiagnosisResult(Paged):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosedAxes(PagedAxes[DiagnosisResult]):
+class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
     """What the models of several axes lack.
 
     Parameters
@@ -166,16 +185,6 @@ class DiagnosedAxes(PagedAxes[DiagnosisResult]):
 
     results: Mapping[str, DiagnosisResult]
     machine: tuple[MachineEffect, ...] = ()
-
-    @property
-    def model(self) -> dict[str, ThermalModel]:
-        """The extended model of each axis, as read back from their file."""
-        return {axis: result.model for axis, result in self.results.items()}
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the model file."""
-        return next(iter(self.results.values())).sha256
 
     @property
     def verdict(self) -> str:
@@ -229,25 +238,14 @@ class DiagnosedAxes(PagedAxes[DiagnosisResult]):
         note = "The same form on every axis, its size fitted; negative: against its channel."
         return Table(title="What each effect moves, µm peak to peak", head=head, rows=rows, note=note)
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the extended model of all axes to a file, or everything to a folder; as `DiagnosisResult.save`."""
-        target = Path(path)
-        if target.suffix.lower() == ".toml":
-            write_axes(target, self.model)
-        else:
-            require_folder(target)
-            self.save_all(target, series=True)
-        return target
+    def write_model_file(self, path: Path) -> None:
+        """Write the extended models of all axes into one file."""
+        write_axes(path, self.model)
 
-    def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
-        """Write as `DiagnosisResult.save_all`; the curves of each axis into a file of its own, `series-z.csv`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        model, found, page, curves = (folder / name for name in FILES)
-        write_axes(model, self.model)
-        found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        self.write_page(page, also=also)
-        for axis, result in self.results.items() if series else ():
-            result.write_series(curves.with_stem(f"{curves.stem}-{axis}"))
+    def write_series(self, path: Path) -> None:
+        """Write the curves of each axis into a file of its own, such as `series-z.csv`."""
+        for axis, result in self.results.items():
+            result.write_series(path.with_stem(f"{path.stem}-{axis}"))
 
     def as_page(self) -> Page:
         """Return the page: what is said of the machine, a column for each axis, and a section for each."""

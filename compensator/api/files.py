@@ -1,19 +1,23 @@
-"""Models as stored in their files, and pages in every format."""
+"""Models as stored in their files, curves as CSV, and pages in every format."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from compensator.arrays import Vector
+from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
 from compensator.data.axes import AxisLike, asked_axes
 from compensator.display import Shown
 from compensator.errors import ModelError, UsageError
 from compensator.model.model_file import load_axes, load_model, parse_axes
 from compensator.model.model_writer import dump_axes
+from compensator.model.simulation import csv_rows
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
@@ -90,6 +94,19 @@ def axes_as_in_file(models: Mapping[str, ThermalModel]) -> dict[str, ThermalMode
         If they cannot be stored in a file.
     """
     return parse_axes(dump_axes(models).encode("utf-8"), source=next(iter(models.values())).name)
+
+
+def write_curves(path: str | os.PathLike[str], columns: dict[str, Vector]) -> Path:
+    """Write columns that have a `t_s` as CSV; a missing value is an empty cell.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    with atomic_write(Path(path)) as file:
+        csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
+    return Path(path)
 
 
 class Paged(Shown):

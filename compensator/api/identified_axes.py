@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compensator.api.axis_results import PagedAxes
+from compensator.api.axis_results import AxisModels
 from compensator.api.identification_result import IdentificationResult
 from compensator.axes import label_of
 from compensator.codes import Remark
@@ -19,14 +19,13 @@ from compensator.identify.pairs import Pair
 from compensator.identify.summary import MODEL, estimates
 from compensator.model.free_run import NOTHING
 from compensator.model.model_writer import write_axes
-from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class IdentifiedAxes(PagedAxes[IdentificationResult]):
+class IdentifiedAxes(AxisModels[IdentificationResult]):
     """Identified models of several axes of a machine.
 
     Parameters
@@ -45,16 +44,6 @@ class IdentifiedAxes(PagedAxes[IdentificationResult]):
     shared: tuple[tuple[str, ...], ...] = ()
     alone_rms_um: Mapping[str, float] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
-
-    @property
-    def model(self) -> dict[str, ThermalModel]:
-        """The model of each axis, as read back from their file."""
-        return {axis: result.model for axis, result in self.results.items()}
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the model file."""
-        return next(iter(self.results.values())).model.sha256
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
@@ -97,7 +86,7 @@ class IdentifiedAxes(PagedAxes[IdentificationResult]):
         return f"{'; '.join(words)}. Errors on held-out blocks of time, rms: {errors}."
 
     def _times(self, axis: str) -> str:
-        return _names([f"{float(f'{tau:.3g}'):g}" for tau in self.results[axis].calibration.deformation.main.taus_min])
+        return _listed([f"{float(f'{tau:.3g}'):g}" for tau in self.results[axis].calibration.deformation.main.taus_min])
 
     def table(self) -> Table:
         """Return gains, time constants and errors, with a column for each axis."""
@@ -151,7 +140,11 @@ class IdentifiedAxes(PagedAxes[IdentificationResult]):
 
 def _names(axes: Sequence[str] | Mapping[str, Any]) -> str:
     """Return axes by name, such as "X, Y and Z"."""
-    *first, last = map(label_of, axes) if axes else [""]
+    return _listed([label_of(axis) for axis in axes])
+
+
+def _listed(words: Sequence[str]) -> str:
+    *first, last = words or [""]
     return f"{', '.join(first)} and {last}" if first else last
 
 

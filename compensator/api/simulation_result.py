@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compensator.api.axis_results import AxisResults
+from compensator.api.files import write_curves
 from compensator.arrays import Vector
-from compensator.atomic_write import atomic_write
 from compensator.axes import AxisWords
 from compensator.codes import Remark
 from compensator.display import Shown, Table, Words, text_of_all, warnings_of
 from compensator.model.free_run import NOTHING, in_words, table_of_scores
-from compensator.model.simulation import SCORE_HEAD, Scores, csv_rows
+from compensator.model.simulation import SCORE_HEAD, Scores
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -102,9 +101,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         OSError
             If the file cannot be written.
         """
-        with atomic_write(Path(path)) as file:
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.table))
-        return Path(path)
+        return write_curves(path, self.table)
 
     def plot(self) -> Plot:
         """Plot measured and predicted deformation, and the residual."""
@@ -146,6 +143,4 @@ class SimulatedAxes(AxisResults[SimulationResult]):
         OSError
             If the file cannot be written.
         """
-        with atomic_write(Path(path)) as file:
-            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.table))
-        return Path(path)
+        return write_curves(path, self.table)
