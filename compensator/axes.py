@@ -24,6 +24,8 @@ FIRST = "y"
 NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 #: Stays as it is in every text: an option of the Python functions.
 _OPTION = "y_std_um in Python"
+#: What is written for Y in texts and columns.
+_OF_FIRST = r"\by(?=_(?:[a-z]+_)*um(?:_|\b))|\bresidual_um\b|\bY\b"
 _Any = TypeVar("_Any")
 
 
@@ -62,7 +64,8 @@ class AxisWords:
     axis : str
         The axis.
     kept : frozenset of str
-        Names of the user, such as those of files, which stay as they are.
+        Names of the user, such as those of files, channels and models, which stay as they are. A name that is nothing
+        but Y cannot: the text means the axis nearly everywhere.
 
     Examples
     --------
@@ -97,9 +100,11 @@ class AxisWords:
             raise type(error)(text) from error
 
     def _pattern(self) -> re.Pattern[str]:
-        kept = sorted({_OPTION, *filter(None, self.kept)}, key=len, reverse=True)
-        names = "|".join(map(re.escape, kept))
-        return re.compile(rf"(?P<kept>{names})|\by(?=_(?:[a-z]+_)*um(?:_|\b))|\bresidual_um\b|\bY\b")
+        changed = (name for name in self.kept if name != FIRST.upper() and re.search(_OF_FIRST, name))
+        names = "|".join(map(re.escape, sorted({_OPTION, *changed}, key=len, reverse=True)))
+        # Whole names only: a channel y_scale_um does not keep y_scale_um_2. What is of the axis already stays, too: the
+        # columns of an axis y_slope begin as those of Y.
+        return re.compile(rf"(?P<kept>(?<!\w)(?:{names})(?!\w)|\b{re.escape(self.axis)}(?=_))|{_OF_FIRST}")
 
     def _in_words(self, match: re.Match[str]) -> str:
         found = match[0]

@@ -6,7 +6,7 @@ the code in messages, recordings and JSON. To add a code, add a member here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from types import MappingProxyType
 
@@ -54,7 +54,7 @@ class Remark(str):
     --------
     >>> remark = Remark(ModelWarning.TWIN_MODES, "Two time constants of the DTF coincide at 20 min.")
     >>> remark
-    'Two time constants of the DTF coincide at 20 min. Try one mode fewer with --order.'
+    'Two time constants of the DTF coincide at 20 min. Try one mode fewer with --order, of the TTF with --ttf.'
     >>> remark.code
     <ModelWarning.TWIN_MODES: 'twin_modes'>
     """
@@ -108,6 +108,15 @@ class State(Code):
         "See the reasons; correct the cause before the next precise cut.",
     )
     FAULT = "fault", "There is no reliable offset.", "Do not rely on compensation; see the reasons and the events."
+
+
+#: From the best to the worst.
+_STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT)
+
+
+def worst_state(states: Iterable[State]) -> State:
+    """Return the worst of several states, such as those of several axes."""
+    return max(states, key=_STATES.index)
 
 
 class Reason(Code):
@@ -437,7 +446,7 @@ class ModelWarning(Code):
     TWIN_MODES = (
         "twin_modes",
         "Two time constants of a path coincide: their standard errors are meaningless.",
-        "Try one mode fewer with --order.",
+        "Try one mode fewer with --order, of the TTF with --ttf.",
     )
     INVERSE_NOISE = (
         "inverse_noise",

@@ -13,20 +13,18 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta
 
+from compensator.config_axes import Axes, check_axes, with_limits_of_y
+from compensator.config_types import Micrometres, MicrometresPerMin, Name, Text
+from compensator.config_types import Table as _Table
 from compensator.errors import ConfigError, UsageError
 from compensator.input_file import SETTINGS_BYTES, parse_toml, read_file, resolved
 
-#: Above 0, with the largest value that a machine can have: a limit beyond it is a slip of the pen, and no limit.
-Micrometres = Annotated[float, Meta(gt=0, le=5000)]
-MicrometresPerMin = Annotated[float, Meta(gt=0, le=1000)]
 Kelvins = Annotated[float, Meta(gt=0, le=200)]
 Minutes = Annotated[float, Meta(gt=0, le=100_000)]
 #: Of a channel of any unit, such as rpm/min.
 Rate = Annotated[float, Meta(gt=0, le=1e9)]
 #: Megabytes, or days.
 Amount = Annotated[float, Meta(gt=0, le=1e9)]
-Text = Annotated[str, Meta(max_length=4096)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
@@ -39,10 +37,6 @@ _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]
 #: Transports on which participants authenticate by certificates.
 _SECURED = ("tls/", "quic/")
 _TLS_KEYS = ("tls_ca", "tls_certificate", "tls_key")
-
-
-class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table that refuses unknown keys."""
 
 
 class Machine(_Table, frozen=True, kw_only=True):
@@ -105,7 +99,7 @@ class Validity(_Table, frozen=True, kw_only=True):
 
 
 class Limits(_Table, frozen=True, kw_only=True):
-    """`[limits]`: limits of the offset."""
+    """`[limits]`: limits of the offset; on a machine of several axes those of Y are in `[axis.y]`."""
 
     offset_max_um: Micrometres
     offset_rate_max_um_per_min: MicrometresPerMin
@@ -197,7 +191,7 @@ class Loop(_Table, frozen=True, kw_only=True):
     `record_h`: how much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the
     present model, on data after the diagnosis: hours of measured Y or the number of probes, and by how many
     standard deviations the present model is refuted (by half as many the candidate is the better one).
-    `watch_h`: how long the model before is compared after an adoption at most.
+    `watch_h`: how long the model before is compared after an adoption, and a candidate at most.
     `memory_mb`, `time_limit_min`: limits of a diagnosis.
     """
 
@@ -236,8 +230,8 @@ class Zenoh(_Table, frozen=True, kw_only=True):
 
     prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", max_length=200)]
     mode: Literal["peer", "client", "router"] = "peer"
-    listen: Annotated[list[Text], Meta(max_length=50)] = []
-    connect: Annotated[list[Text], Meta(max_length=50)] = []
+    listen: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
+    connect: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
     tls_ca: str | None = None
     tls_certificate: str | None = None
     tls_key: str | None = None
@@ -280,7 +274,7 @@ class Recording(_Table, frozen=True, kw_only=True):
 
 
 class Config(_Table, frozen=True, kw_only=True):
-    """A complete configuration file."""
+    """A complete configuration file; `limits` are those of Y, `axis` is None on a machine that has Y alone."""
 
     machine: Machine
     model: ModelChoice
@@ -298,6 +292,7 @@ class Config(_Table, frozen=True, kw_only=True):
     plausibility: Plausibility | None = None
     probe: Probe | None = None
     loop: Loop | None = None
+    axis: Axes | None = None
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -377,9 +372,11 @@ def parse_config(data: bytes, *, source: str) -> Config:
     if (place := _with_nul(table)) is not None:
         raise ConfigError(f"{source}: {place}: contains \\u0000, expected a text without it")
     try:
-        config = msgspec.convert(table, Config)
+        config = msgspec.convert(with_limits_of_y(table), Config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {_in_words(str(error), table)}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
     try:
         _check(config)
     except ConfigError as error:
@@ -460,6 +457,8 @@ def _check(config: Config) -> None:
         raise ConfigError(
             f"loop.policy = {config.loop.policy!r}: nothing measures Y, expected a channel 'y_um' or the table [probe]"
         )
+    if config.axis is not None:
+        check_axes(config.axis, loop=config.loop is not None and config.loop.is_on)
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key), _TEMPERATURES)
     _check_zenoh(config.zenoh)

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 
+from compensator.axes import FIRST
 from compensator.messages import Event
 
 
@@ -189,7 +190,7 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     present_rms_um, candidate_rms_um : float, optional
         Root mean square of measured − predicted Y: of the present model and of the other one, µm.
     deviations : float, optional
-        By how many standard deviations of the difference the other model is better; negative if it is worse.
+        By how many standard deviations the present model is refuted; negative if the other one is.
     effective : float, optional
         Number of independent values that this rests on.
     ratio : float, optional
@@ -198,6 +199,8 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
         Whether the errors about the zero contradict the verdict, because measured Y has moved by itself.
     offset_change_um : float, optional
         By how much the offset would move at the end of the recordings, µm.
+    axes : dict of str to ComparisonData
+        On a machine of several axes, each further axis that is measured, by its own values; the other fields are of Y.
     """
 
     verdict: ComparisonVerdict
@@ -214,6 +217,11 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     ratio: float | None = None
     y_moved: bool = False
     offset_change_um: float | None = None
+    axes: dict[str, ComparisonData] = {}
+
+    def by_axis(self) -> dict[str, ComparisonData]:
+        """Return the comparison of each axis, that of Y first."""
+        return {FIRST: self, **self.axes}
 
 
 class LoopAction(StrEnum):

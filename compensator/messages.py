@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from importlib import resources
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
@@ -200,6 +200,10 @@ class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
         Number of compared probes.
     adopted_utc_ns : int
         Time of the last adoption by the loop; 0 before.
+    before_effects : list of str, optional
+        Effects of the model before the last adoption, where it runs beside a candidate.
+    before_text : str
+        How it compares, in words.
     """
 
     phase: Literal["idle", "shadow", "proposed", "watching"]
@@ -216,6 +220,8 @@ class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
     hours: float
     probes: int
     adopted_utc_ns: int
+    before_effects: list[str] | None = None
+    before_text: str = ""
 
 
 class Status(Message, frozen=True, kw_only=True):
@@ -387,7 +393,7 @@ class Candidate(Message, frozen=True, kw_only=True):
     present_rms_um, candidate_rms_um : float or None
         Root mean square of measured − predicted Y, µm.
     deviations : float or None
-        By how many standard deviations of the difference it is better; negative if it is worse.
+        By how many standard deviations the present model is refuted; negative if this one is.
     hours : float
         Hours of usable blocks of measured Y.
     probes : int
@@ -505,7 +511,10 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
 }
 
 
-def degraded(offset: Offset, reason: str) -> Offset:
+AnyOffset = TypeVar("AnyOffset", bound=Offset)
+
+
+def degraded(offset: AnyOffset, reason: str) -> AnyOffset:
     """Return an offset with one reason more; a state of `ok` becomes `degraded`."""
     state = State.DEGRADED if offset.state == State.OK else offset.state
     return msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, reason])
@@ -524,14 +533,16 @@ def number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def schemas() -> dict[str, dict[str, Any]]:
+def schemas(messages: Mapping[str, type[msgspec.Struct]] = MESSAGES) -> dict[str, dict[str, Any]]:
     """Make the JSON Schema of every message from its class."""
     made = {}
-    for name, message in MESSAGES.items():
+    for name, message in messages.items():
         definitions = msgspec.json.schema(message)["$defs"]
         definition = definitions.pop(message.__name__)
         if "state" in definition["properties"]:  # its codes are listed in place, without a reference
-            definition["properties"]["state"] = {"enum": definitions.pop(State.__name__)["enum"]}
+            definition["properties"]["state"] = {"enum": definitions[State.__name__]["enum"]}
+            if f"#/$defs/{State.__name__}" not in str(definitions):
+                del definitions[State.__name__]
         made[name] = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             **definition,

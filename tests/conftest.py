@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Iterator
 
@@ -10,10 +11,21 @@ import pytest
 
 from compensator.blas import one_thread_from_start
 
-# As the commands do, before a test loads numpy: the two processes of a test run share the cores.
+# As the commands do, before a test loads numpy: the processes of a test run share the cores.
 one_thread_from_start()
 # A shell starts what runs in the background with SIGINT ignored, and so would every program that a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _no_wait_for_the_disk(descriptor: int) -> None:
+    """Check the descriptor only: nobody cuts the power of a test, and the wait is a large part of a simulated day.
+
+    What a test starts as a process of its own, and kills, syncs as it does at a machine.
+    """
+    os.fstat(descriptor)
+
+
+os.fsync = _no_wait_for_the_disk
 
 
 @pytest.fixture(autouse=True)

@@ -228,7 +228,7 @@ def compare(
     check_each_once(measured)
     results = {}
     for name in _common_axes(list(found.values()), measured, axis):
-        words = words_of(name, measured)
+        words = words_of(name, measured, models=found)
         with words.errors():
             own = {model: several[name] for model, several in found.items()}
             results[name] = _compare(own, of_axis(measured, name), from_h, words)

@@ -232,7 +232,9 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
         rows = []
         for one in self.machine:
             shares = {share.axis: share for share in one.shares}
-            cells = (f"{shares[axis].moves_um:.1f} ± {shares[axis].std_um:.1f}" for axis in self.results)
+            cells = (
+                f"{shares[axis].moves_um:z.1f} ± {shares[axis].std_um:.1f}".replace("-", "−") for axis in self.results
+            )
             rows.append([" ".join(filter(None, one.place)), *cells])
         head = ["effect", *map(label_of, self.results)]
         note = "The same form on every axis, its size fitted; negative: against its channel."
@@ -322,7 +324,7 @@ def diagnose(
         return executor.map(partial(in_one_thread, function), *values)
 
     def diagnosed(one: str, number: int, of: int, expected: frozenset[Place] = frozenset()) -> DiagnosisResult:
-        words = words_of(one, whole, validation)
+        words = words_of(one, whole, validation, models=[bases[one].name])
         with words.errors():
             return _diagnosed(
                 bases[one],

@@ -140,7 +140,7 @@ def identify(
     numbers = {"fit_until_h": fit_until_h, "y_std_um": y_std_um}
     provenance = partial(_provenance, sources, settings, columns or {}, numbers)
     calibrations: dict[str, Calibration] = {}
-    words = {one: words_of(one, *sources.values()) for one in axes}
+    words = {one: words_of(one, *sources.values(), models=[name]) for one in axes}
     # The axis that was measured most gives the heat.
     for i, one in enumerate(sorted(axes, key=lambda each: -_values(sources["fit"], each))):
         with words[one].errors():

@@ -19,6 +19,7 @@ from compensator.identify.pairs import Pair
 from compensator.identify.summary import MODEL, estimates
 from compensator.model.free_run import NOTHING
 from compensator.model.model_writer import write_axes
+from compensator.tilt_lines import tilt_lines
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
@@ -52,9 +53,16 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
             "shared_time_constants": [list(group) for group in self.shared],
             "alone_folds_rms_um": dict(self.alone_rms_um),
             "pairs": [
-                {"probes": [one.first, one.second], "correlation": one.correlation, "ratio": one.ratio, "why": str(one)}
+                {
+                    "probes": [one.first, one.second],
+                    "correlation": one.correlation,
+                    "ratio": one.ratio,
+                    "apart_um": one.apart_um,
+                    "why": str(one),
+                }
                 for one in self.pairs
             ],
+            "tilt_lines": self.tilt_lines(),
         }
 
     def contents(self) -> Sequence[str | Table | Words | Listing]:
@@ -67,6 +75,12 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
         parts.append(self.table())
         if self.pairs:
             parts.append(Words(title="Pairs of probes", lines=[str(one) for one in self.pairs]))
+            parts.append(
+                Listing(
+                    title="Lines for the configuration, if a pair measures a tilt; fill in what the data do not show",
+                    lines=self.tilt_lines(),
+                )
+            )
         warned: dict[Remark, list[str]] = {}
         for axis, result in self.results.items():
             for warning in result.words(result.criticism.warnings):
@@ -74,6 +88,11 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
         parts += warnings_of(warning.worded(f"{_names(axes)}: {warning}") for warning, axes in warned.items())
         remarks = dict.fromkeys(text for one in self.results.values() for text in one.words(one.calibration.remarks))
         return [*parts, *([Words(title="Remarks on the data", lines=list(remarks))] if remarks else [])]
+
+    def tilt_lines(self) -> str:
+        """Return the lines of a configuration for the tilts that the pairs measure; empty without pairs."""
+        against = [(one.first, one.second) for one in self.pairs if one.correlation < 0.0]
+        return tilt_lines(((one.first, one.second, one.apart_um) for one in self.pairs), against=against)
 
     def verdict(self) -> str:
         """Return what is said of the machine, in a few sentences."""

@@ -80,7 +80,7 @@ def simulate(
     measured = measurements(data, "data", columns, needed=True)
     results = {}
     for name, what in models.items():
-        words = words_of(name, measured)
+        words = words_of(name, measured, models=[what.name])
         with words.errors():
             results[name] = _simulate(what, with_axis(measured, name), words, correct=correct, y_std_um=y_std_um)
     if len(results) > 1:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from compensator.audit.findings import utc
 from compensator.clock import NS
 from compensator.codes import AuditRemark, Remark
@@ -18,7 +20,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
 from compensator.report.history import Spread
-from compensator.service.compensation import Compensation, Outcome, slowest_min
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_in
 from compensator.service.status import Zero
 
@@ -177,7 +179,8 @@ class _Run:
         if self._free is not None and data == self._config:
             return self._free
         try:
-            self._free = FreeRun(Compensation(config, self._model))
+            # The other model is compared on Y, also on a machine of several axes.
+            self._free = FreeRun(Compensation(msgspec.structs.replace(config, axis=None), self._model))
         except ServiceError as error:
             raise DataError(f"{error} in the recording") from error
         self._config = data
@@ -194,7 +197,7 @@ class _Run:
         compensation.begin(replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0))
         figures = (
             f"{step.file}: starts while the machine is running, and the other model has no state except the zero; "
-            f"its first {3 * slowest_min(compensation.model) / 60.0:.0f} h are uncertain."
+            f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
         )
         self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import msgspec
@@ -12,7 +13,8 @@ from compensator.audit.result import RecordingAudit
 from compensator.codes import Reason
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
-from compensator.messages import Event, Offset, degraded, encode
+from compensator.messages import Event, Message, Offset, degraded, encode
+from compensator.messages_axes import AxisOffset, recorded_offsets
 from compensator.recording.container import Contents
 from compensator.recording.reading import RawRecord
 from compensator.service.compensation import Compensation, Outcome
@@ -53,7 +55,7 @@ class ReplayCheck:
                 raise DataError(f"{result.file}: state.json: {error}") from error
         result.model = self.compensation.model.sha256
         self._loop = recorded_loop(contents, self.compensation, result.file)
-        #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
+        #: A sample of which the estimate or the offset is missing, or either without it: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
     def check(self, records: list[RawRecord]) -> None:
@@ -79,11 +81,13 @@ class ReplayCheck:
         decided = self._loop.apply_inputs(step) if self._loop is not None else []
         outcome = apply(self.compensation, step)
         if isinstance(outcome, Outcome):
-            followed = self._loop.process(outcome) if self._loop is not None else Followed(None, ())
-            self._compare(step, outcome, Followed(followed.candidate, (*decided, *followed.notes)))
+            followed = self._loop.process(outcome) if self._loop is not None else Followed((), ())
+            self._compare(step, outcome, Followed(followed.candidates, (*decided, *followed.notes)))
         elif outcome is not None:
-            expected = self._as_published(outcome, step.records["offset"].data)
-            self._matches("offset", expected, step.records["offset"])
+            held = self.compensation.held_axes(outcome.machine, outcome.seq, outcome.time_utc_ns)
+            self._compare_held(step, held)
+        else:
+            self._incomplete = self._of_no_sample(step)
 
     def finish(self) -> None:
         """Add the results that are known only at the end."""
@@ -108,27 +112,29 @@ class ReplayCheck:
             result.first_seq, result.first_ns = sample.seq, sample.time_utc_ns
         result.last_seq, result.last_ns = sample.seq, sample.time_utc_ns
         result.samples += 1
-        if not self._probes_match(step, outcome):
+        if self._has_repeated(step, sample) or not self._probes_match(step, outcome):
             return
-        offset = outcome.offset
-        if "offset" in records:
-            offset = self._as_published(offset, records["offset"].data)
-        messages = {"sample": sample, "estimate": outcome.estimate, "candidate": followed.candidate, "offset": offset}
-        if "candidate" in records and followed.candidate is None:
-            recorded = Field(
-                name="message", recorded=records["candidate"].data.decode("utf-8", "replace"), recomputed=None
-            )
+        candidates = followed.candidates
+        offsets = self._offsets((outcome.offset, *outcome.further), records)
+        if self._has_unknown_axes(offsets, sample, records):
+            return
+        if len(step.candidates) > len(candidates):
+            extra = step.candidates[len(candidates)].data.decode("utf-8", "replace")
+            recorded = Field(name="message", recorded=extra, recomputed=None)
             self._count(self._difference("candidate", sample, (recorded,)))
             return
-        for topic, message in messages.items():
-            if message is None:
-                continue
-            record = records.get(topic)
+        messages: list[tuple[str, Message, RawRecord | None]] = [
+            ("sample", sample, records.get("sample")),
+            ("estimate", outcome.estimate, records.get("estimate")),
+            *(("candidate", *pair) for pair in zip_longest(candidates, step.candidates)),
+            *((topic, offset, records.get(topic)) for topic, offset in offsets.items()),
+        ]
+        for topic, message, record in messages:
             if record is None:
                 nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
-                self._incomplete = self._difference(topic, message, (nothing,))
+                self._incomplete = self._difference(topic, sample, (nothing,))
                 return
-            if not self._matches(topic, message, record):
+            if not self._matches(topic, message, record, of=sample):
                 return
         for note in (*outcome.notes, *followed.notes):
             if not any(is_recorded(note, event) for event in step.events):
@@ -138,6 +144,61 @@ class ReplayCheck:
                 self._count(
                     self._difference("event", sample, (Field(name=event.kind, recorded=event.data, recomputed=None),))
                 )
+
+    def _compare_held(self, step: RecordedStep, held: Sequence[Offset]) -> None:
+        """Compare the offsets of a sample that could not be processed, up to the first difference."""
+        messages = self._offsets(held, step.records)
+        if self._has_repeated(step, held[0]) or self._has_unknown_axes(messages, held[0], step.records):
+            return
+        for topic, message in messages.items():
+            record = step.records.get(topic)
+            if record is None:
+                nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
+                self._incomplete = self._difference(topic, held[0], (nothing,))
+                return
+            if not self._matches(topic, message, record, of=held[0]):
+                return
+
+    def _offsets(self, offsets: Sequence[Offset], records: Mapping[str, RawRecord]) -> dict[str, Any]:
+        """Return the records of the offsets of a sample, as they were published if the disk was late."""
+        first, *further = offsets
+        found: dict[str, Any] = {}
+        if further:
+            own = records.get("offsets")
+            published = [self._as_published(one, own.data) if own is not None else one for one in further]
+            found["offsets"] = recorded_offsets(one for one in published if isinstance(one, AxisOffset))
+        found["offset"] = self._as_published(first, records["offset"].data) if "offset" in records else first
+        return found
+
+    def _has_repeated(self, step: RecordedStep, of: Message) -> bool:
+        """Count a message that is recorded twice for one sample: the replay gives one, whatever the other says."""
+        for record in step.repeated[:1]:
+            text = record.data.decode("utf-8", "replace")
+            field = Field(name="message recorded twice", recorded=text, recomputed=None)
+            self._count(self._difference(record.topic, of, (field,)))
+        return bool(step.repeated)
+
+    def _of_no_sample(self, step: RecordedStep) -> Difference | None:
+        """Return the first message that belongs to a sample, in a group without one; a kill may leave it."""
+        for record in (*step.records.values(), *step.candidates):
+            if record.topic != "seal":
+                field = Field(name="message", recorded=record.data.decode("utf-8", "replace"), recomputed=None)
+                return Difference(
+                    file=self._result.file,
+                    topic=record.topic,
+                    seq=self._result.last_seq,
+                    time_utc_ns=record.log_time_ns,
+                    fields=(field,),
+                )
+        return None
+
+    def _has_unknown_axes(self, messages: Mapping[str, Any], of: Message, records: Mapping[str, RawRecord]) -> bool:
+        """Count offsets that are recorded for axes that the machine has not."""
+        if "offsets" not in records or "offsets" in messages:
+            return False
+        text = records["offsets"].data.decode("utf-8", "replace")
+        self._count(self._difference("offsets", of, (Field(name="message", recorded=text, recomputed=None),)))
+        return True
 
     def _probes_match(self, step: RecordedStep, outcome: Outcome) -> bool:
         """Compare the verdicts on the probes of a sample, up to the first difference."""
@@ -157,13 +218,13 @@ class ReplayCheck:
                 return degraded(expected, reason)
         return expected
 
-    def _matches(self, topic: str, message: Any, record: RawRecord) -> bool:
+    def _matches(self, topic: str, message: Any, record: RawRecord, of: Message | None = None) -> bool:
         recorded, recomputed = record.data, encode(message)
         if recorded == recomputed:
             return True
         first = self._result.difference is None
         fields = tuple(differing_fields(recorded, recomputed)) if first else ()
-        self._count(self._difference(topic, message, fields))
+        self._count(self._difference(topic, of or message, fields))
         return False
 
     def _difference(self, topic: str, message: Any, fields: tuple[Field, ...]) -> Difference:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from compensator.errors import ConfigError
 from compensator.input_file import resolved
@@ -15,25 +15,20 @@ from compensator.receiver.settings import read_table
 UNITS_UM = {"mm": 1000.0, "um": 1.0}
 #: Security policies of OPC UA that are secure.
 POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss")
+C = TypeVar("C", bound="Connection")
 _FILES = ("password_file", "certificate", "private_key", "server_certificate")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OpcUa:
-    """`[opcua]`.
+class Connection:
+    """What `[opcua]` has for one axis and for several.
 
     Parameters
     ----------
     endpoint : str
         Such as `opc.tcp://192.168.214.241:4840`.
-    offset_node : str
-        A REAL or LREAL, such as `ns=2;s=/Plc/DB100.DBD0:REAL`.
     unit : str
-        `mm` or `um`: unit of the value.
-    sign : int
-        1 or −1: whether the control adds or subtracts it. There is no default: it is determined on the machine.
-    sign_checked : str
-        Who determined it, when and how, as text.
+        `mm` or `um`: unit of the values.
     cycle_s : float
         Interval of reading and writing, s.
     readback_tolerance_um : float
@@ -53,10 +48,7 @@ class OpcUa:
     """
 
     endpoint: str
-    offset_node: str
     unit: str
-    sign: int
-    sign_checked: str
     cycle_s: float = 1.0
     readback_tolerance_um: float = 0.1
     resume_after_s: float = 10.0
@@ -79,6 +71,25 @@ class OpcUa:
         return UNITS_UM[self.unit]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpcUa(Connection):
+    """`[opcua]` of one axis.
+
+    Parameters
+    ----------
+    offset_node : str
+        A REAL or LREAL, such as `ns=2;s=/Plc/DB100.DBD0:REAL`.
+    sign : int
+        1 or −1: whether the control adds or subtracts it. There is no default: it is determined on the machine.
+    sign_checked : str
+        Who determined it, when and how, as text.
+    """
+
+    offset_node: str
+    sign: int
+    sign_checked: str
+
+
 def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
     """Read and check a bridge's file; nothing is opened.
 
@@ -94,39 +105,66 @@ def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
             raise ReceiverError(f"{path}: opcua: missing, expected a table [opcua]")
         if tables:
             raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected receiver, opcua")
-        for key in ("sign", "sign_checked"):
-            if key not in table:
-                raise ReceiverError(
-                    f"{path}: opcua.{key}: missing; determine the sign on this machine with a dial gauge, and enter "
-                    f'who determined it, when and how (sign = 1 or -1, sign_checked = "…")'
-                )
+        require_sign(table, f"{path}: opcua")
         opcua = read_table(OpcUa, table, source=str(path), name="opcua")
-        _check(opcua, str(path))
+        check_value(opcua, f"{path}: opcua")
+        check_connection(opcua, str(path))
     except ReceiverError as error:
         raise ConfigError(str(error)) from error
+    return receiver, with_files(opcua, str(path))
+
+
+def require_sign(table: dict[str, Any], where: str) -> None:
+    """Refuse a table without the sign and who determined it."""
+    for key in ("sign", "sign_checked"):
+        if key not in table:
+            raise ReceiverError(
+                f"{where}.{key}: missing; determine the sign on this machine with a dial gauge, and enter "
+                f'who determined it, when and how (sign = 1 or -1, sign_checked = "…")'
+            )
+
+
+def with_files(opcua: C, path: str) -> C:
+    """Make the names of files absolute.
+
+    Raises
+    ------
+    ConfigError
+        Where one is not there.
+    """
     folder = Path(path).parent
     given = {key: getattr(opcua, key) for key in _FILES}
     files: dict[str, Any] = {key: str(resolved(folder / name)) for key, name in given.items() if name}
     for key, file in files.items():
         if not Path(file).is_file():
             raise ConfigError(f"{path}: opcua.{key} = {given[key]!r}: no such file")
-    return receiver, replace(opcua, **files)
+    return replace(opcua, **files)
 
 
-def _check(opcua: OpcUa, path: str) -> None:
+def check_value(one: Any, where: str) -> None:
+    """Check node and sign of a value."""
+
+    def wrong(key: str, expected: str) -> ReceiverError:
+        return ReceiverError(f"{where}.{key} = {getattr(one, key)!r}: expected {expected}")
+
+    if one.sign not in (1, -1):
+        raise wrong("sign", "1 or -1, determined on this machine with a dial gauge")
+    if not one.sign_checked.strip():
+        raise wrong("sign_checked", "who determined the sign, when and how")
+    if not one.offset_node:
+        raise wrong("offset_node", "a node such as ns=2;s=/Plc/DB100.DBD0:REAL")
+
+
+def check_connection(opcua: Connection, path: str) -> None:
+    """Check what is the same for one axis and for several."""
+
     def wrong(key: str, expected: str) -> ReceiverError:
         return ReceiverError(f"{path}: opcua.{key} = {getattr(opcua, key)!r}: expected {expected}")
 
-    if opcua.sign not in (1, -1):
-        raise wrong("sign", "1 or -1, determined on this machine with a dial gauge")
-    if not opcua.sign_checked.strip():
-        raise wrong("sign_checked", "who determined the sign, when and how")
     if opcua.unit not in UNITS_UM:
         raise wrong("unit", f"one of {', '.join(UNITS_UM)}")
     if not opcua.endpoint.startswith("opc.tcp://"):
         raise wrong("endpoint", "opc.tcp://HOST:PORT")
-    if not opcua.offset_node:
-        raise wrong("offset_node", "a node such as ns=2;s=/Plc/DB100.DBD0:REAL")
     bounds = {
         "cycle_s": (0.05, 10.0),
         "readback_tolerance_um": (1e-4, 10.0),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
+from compensator.axes import FIRST
 from compensator.channel_lines import channel_lines
 from compensator.commands import Answer, log, log_warnings, warnings_as_json
-from compensator.model.model_file import read_model_bytes
+from compensator.model.model_file import parse_axes, read_model_bytes
 from compensator.service.compensation import Compensation, model_of
-from compensator.service.loading import load
+from compensator.service.loading import Setup, load
 from compensator.service.transfer.model_store import check_model
 
 
@@ -32,6 +34,8 @@ def run(arguments: argparse.Namespace) -> Answer:
         f"{len(devices)} device(s), {len(config.channel)} channel(s). Nothing was opened.\n"
         f"plausibility: {checks}"
     )
+    axes = _axes(setup)
+    text += _axes_text(axes)
     if config.probe is not None:
         probe = config.probe
         tolerance = f"{probe.tolerance_um:g} µm" if probe.tolerance_um is not None else "none"
@@ -47,8 +51,27 @@ def run(arguments: argparse.Namespace) -> Answer:
         "devices": list(devices),
         **warnings_as_json(warnings),
         "checks": checks,
+        **axes,
     }
     return Answer(result, text)
+
+
+def _axes(setup: Setup) -> dict[str, Any]:
+    """Return the axes of a machine and the parts of the model that none of them uses; nothing where all is Y alone."""
+    used = {setup.model.axis, *(part.axis for part in setup.model.parts)}
+    unused = [name for name in parse_axes(setup.model_bytes, source="model") if name not in used]
+    if setup.config.axis is None:
+        return {"axes": [FIRST], "unused_parts": unused} if unused else {}
+    return {"axes": list(setup.config.axis.names()), "unused_parts": unused}
+
+
+def _axes_text(axes: dict[str, Any]) -> str:
+    if not axes:
+        return ""
+    text = f"\naxes: {', '.join(axes['axes'])}"
+    if axes["unused_parts"]:
+        text += f"; the model also has {', '.join(axes['unused_parts'])}, for which there is no table [axis.*]"
+    return text
 
 
 def _without_channels(path: str, model: str, missing: list[str]) -> Answer:

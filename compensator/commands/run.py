@@ -8,6 +8,7 @@ import faulthandler
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -16,6 +17,7 @@ from compensator.codes import State
 from compensator.commands.stopping import on_stop
 from compensator.events import EventKind
 from compensator.messages import Event, Offset
+from compensator.messages_axes import OFFSETS, SHOWN_UNITS, UNITS, AxisOffset, axis_of
 from compensator.service import systemd
 from compensator.service.composition import run_service
 from compensator.service.daemon import Daemon
@@ -40,6 +42,7 @@ class Reporter:
         self._manager = manager
         self._polled = False
         self._state: str = State.STARTING
+        self._further: dict[str, AxisOffset] = {}
 
     def report_poll(self) -> None:
         """Report a complete poll; only this feeds the watchdog.
@@ -54,8 +57,11 @@ class Reporter:
 
     def report_message(self, name: str, data: bytes) -> None:
         """Report a published message."""
+        axis = axis_of(name)
         if name == "offset":
-            self._manager.status(status(msgspec.json.decode(data, type=Offset)))
+            self._manager.status(status(msgspec.json.decode(data, type=Offset), self._further))
+        elif axis is not None:  # published before that of Y
+            self._further[axis] = msgspec.json.decode(data, type=OFFSETS[axis])
         elif name == "event":
             self._log(msgspec.json.decode(data, type=Event))
 
@@ -88,20 +94,28 @@ def level(event: Event) -> int:
     return logging.WARNING if refused else logging.INFO
 
 
-def status(offset: Offset) -> str:
+def status(offset: Offset, further: Mapping[str, AxisOffset] | None = None) -> str:
     """Return state and offset in one line for `systemctl status`.
 
     Parameters
     ----------
     offset : Offset
         The published offset.
+    further : mapping of str to AxisOffset, optional
+        Those of further axes.
     """
     state = offset.state + (f" ({', '.join(offset.reasons)})" if offset.reasons else "")
     if offset.y_offset_um is None:
         return f"{state}: no offset yet; sample {offset.seq}"
     rate = offset.y_offset_rate_um_per_min
     growth = "" if rate is None else f", {rate:+.2f} µm/min"
-    return f"{state}: Y offset {offset.y_offset_um:+.2f} µm{growth}; sample {offset.seq}"
+    others = "".join(
+        f", {axis.upper()} {one.y_offset_um:+.2f} {SHOWN_UNITS[UNITS[axis]]}"
+        + (f" ({one.state})" if one.state != offset.state else "")
+        for axis, one in (further or {}).items()
+        if one.y_offset_um is not None
+    )
+    return f"{state}: Y offset {offset.y_offset_um:+.2f} µm{growth}{others}; sample {offset.seq}"
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -31,13 +33,40 @@ def on_stop(stop: Callable[[], object]) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stop)
 
 
+class Stop:
+    """What a signal sets.
+
+    A handler runs in the main thread, also while that thread holds the lock of a `threading.Event` that it waits for,
+    and would then wait for it itself, for ever: so there is no lock here.
+    """
+
+    def __init__(self) -> None:
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+
+    def set(self) -> None:
+        """End every wait."""
+        with suppress(BlockingIOError):  # it is full, so it is set
+            os.write(self._write, b".")
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for at most this time, s; return whether it is set."""
+        return bool(select.select([self._read], [], [], timeout_s)[0])
+
+    def close(self) -> None:
+        """Close what it waits on."""
+        os.close(self._read)
+        os.close(self._write)
+
+
 @contextmanager
-def until_stopped() -> Iterator[threading.Event]:
-    """Yield an event that each signal sets."""
-    stopped = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in _SIGNALS}
+def until_stopped() -> Iterator[Stop]:
+    """Yield what each signal sets."""
+    stop = Stop()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in _SIGNALS}
     try:
-        yield stopped
+        yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        stop.close()

@@ -9,7 +9,6 @@ import re
 import secrets
 import stat
 import sys
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from rich.live import Live
 from compensator.atomic_write import replace_file
 from compensator.clock import SystemClock
 from compensator.commands import Answer
-from compensator.commands.stopping import until_stopped
+from compensator.commands.stopping import Stop, until_stopped
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import ServiceError, UsageError
 from compensator.input_file import KEY_BYTES, read_file
@@ -157,7 +156,7 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
 class _Watch:
     """Shows the shop until it is stopped."""
 
-    def __init__(self, shop: Shop, source: Source, stopped: threading.Event) -> None:
+    def __init__(self, shop: Shop, source: Source, stopped: Stop) -> None:
         self._shop, self._source, self._stopped = shop, source, stopped
         self._connected = False
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
 
 from compensator.axes import AXES, FIRST, NAME, AxisWords, column_of
 from compensator.data.measurement import Measurement
+from compensator.data.table import EXPORTED
 from compensator.errors import DataError, UsageError
 
+#: Columns whose names are written for Y, also where a table has them.
+_OURS = frozenset({column_of(FIRST), "y_free_um", *EXPORTED})
 AxisLike: TypeAlias = "str | Sequence[str] | None"
 """Axes asked for: one, several, or None for all that there are."""
 
@@ -83,10 +86,22 @@ def with_axis(data: Sequence[Measurement], axis: str) -> list[Measurement]:
     return [one if axis == FIRST else _as_first(one, axis) for one in data]
 
 
-def words_of(axis: str, *data: Sequence[Measurement]) -> AxisWords:
-    """Return the texts of an axis, in which names of data stay as they are."""
-    kept = {name for several in data for one in several for name in (one.name, one.label)}
-    return AxisWords(axis, frozenset(kept))
+def words_of(axis: str, *data: Sequence[Measurement], models: Iterable[str] = ()) -> AxisWords:
+    """Return the texts of an axis, in which names of the user stay as they are.
+
+    Parameters
+    ----------
+    axis : str
+        The axis.
+    *data : sequence of Measurement
+        Their names and those of their channels stay, but for columns that this package writes itself.
+    models : iterable of str
+        Names of models, which stay too.
+    """
+    every = [one for several in data for one in several]
+    kept = {name for one in every for name in (one.name, one.label)}
+    channels = {name for one in every for name in (*one.table.columns, *one.roles.values())}
+    return AxisWords(axis, frozenset(kept | (channels - _OURS) | set(models)))
 
 
 def _as_first(one: Measurement, axis: str) -> Measurement:

@@ -8,17 +8,20 @@ import logging
 import math
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from compensator.atomic_write import atomic_write
+from compensator.axes import FIRST
 from compensator.data.files import measured_probes
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
+from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets, named_for, topic_of
 from compensator.recording.reading import machines_in, messages, recordings_in
 
 log = logging.getLogger("compensator")
@@ -27,13 +30,18 @@ PathLike = str | os.PathLike[str]
 
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "y_ref_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
+_SLOPE = ("y_slope_um_per_m", "y_slope_rate_um_per_m_per_min", "y_slope_std_um_per_m")
+_TOPICS = ("sample", "estimate", "offsets", *(topic_of(axis) for axis in UNITS), "probe")
+#: Values of further axes that the table has; a measured value is in the column of its channel.
+_OF_AXES = ("_dtf_", "_tdtf_", "_pred_", "_std_", "_ref_", "_residual_")
 
 
 def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: str = "") -> int:
     """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
-    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. `y_um` is as
+    offset, its state and reasons; of a machine of several axes the same of each, such as `z_pred_um`, `z_offset_um`,
+    `z_state`. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. `y_um` is as
     measured, and `y_ref_um` its value at the zero: `y_um` − `y_ref_um` counts from the zero of `y_pred_um`. Where no
     displacement sensor measured Y, `y_um` is the deformation that a touch probe showed, at the sample of its time.
 
@@ -65,7 +73,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     for recording in paths:
         before = len(rows)
         probes.append([])
-        for message in messages(recording, ("sample", "estimate", "offset", "probe"), prefix=machine):
+        for message in _messages(recording, machine):
             machines.setdefault(message.machine, recording)
             if isinstance(message, Probe):
                 probes[-1].append(message)
@@ -90,6 +98,12 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         writer.writeheader()
         writer.writerows(rows.values())
     return len(rows)
+
+
+def _messages(recording: Path, machine: str) -> Iterator[Any]:
+    """Yield the messages of a recording, those of further axes one by one."""
+    for message in messages(recording, _TOPICS, prefix=machine):
+        yield from message.messages() if isinstance(message, RecordedOffsets) else (message,)
 
 
 def _add_probes(
@@ -134,8 +148,26 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
             cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.is_good else None
             cells[f"{name}_quality"] = channel.quality
         return cells
+    if isinstance(message, AxisOffset) and message.axis != FIRST:
+        return cells | _axis_cells(message)
     fields = msgspec.structs.asdict(message)
     cells |= {name: fields[name] for name in (_ESTIMATE if isinstance(message, EstimateMessage) else _OFFSET)}
     if isinstance(message, Offset):
         cells["reasons"] = " ".join(message.reasons)
+    if isinstance(message, AxisOffset):
+        cells |= _axis_cells(message)
+    if isinstance(message, AxesEstimate):
+        own = {name: value for name, value in message.axes.items() if not isinstance(value, list)}
+        cells |= {name: value for name, value in own.items() if any(part in name for part in _OF_AXES)}
+    return cells
+
+
+def _axis_cells(message: AxisOffset) -> dict[str, Any]:
+    """Return the columns of an axis of several; state and reasons of Y have no name of an axis."""
+    names = _OFFSET[:3] if message.axis != FIRST else ()
+    cells = {named_for(message.axis, name): getattr(message, name) for name in names}
+    if message.axis != FIRST:
+        cells |= {f"{message.axis}_state": message.state, f"{message.axis}_reasons": " ".join(message.reasons)}
+    if message.y_slope_um_per_m is not UNSET:
+        cells |= {named_for(message.axis, name): getattr(message, name) for name in _SLOPE}
     return cells

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -44,6 +45,22 @@ EXPORTED = (
     "state",
     "reasons",
 )
+#: The same of further axes, tilts and slopes.
+_EXPORTED_AXES = re.compile(
+    r"[xzab]_(state|reasons|(dtf|tdtf|pred|std|ref|residual|offset|offset_std)_(um|urad)"
+    r"|offset_rate_(um|urad)_per_min)|[xyz]_slope_((dtf|tdtf|pred|std)_)?um_per_m|[xyz]_slope_rate_um_per_m_per_min"
+)
+
+
+def is_computed(name: str) -> bool:
+    """Return whether a column of an exported recording was computed by the service.
+
+    Examples
+    --------
+    >>> is_computed("z_pred_um"), is_computed("a_offset_rate_urad_per_min"), is_computed("z_um")
+    (True, True, False)
+    """
+    return name in EXPORTED or _EXPORTED_AXES.fullmatch(name) is not None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +114,7 @@ class Table:
         """
         if not {"y_pred_um", "y_offset_um"} <= self.columns.keys():
             return self, self.remarks
-        kept = {name: values for name, values in self.columns.items() if name not in EXPORTED}
+        kept = {name: values for name, values in self.columns.items() if not is_computed(name)}
         if "heat_measured_w" in kept:
             kept["heat_w"] = kept.pop("heat_measured_w")
         words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."

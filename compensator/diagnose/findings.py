@@ -22,7 +22,7 @@ from compensator.model.thermal_model import Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
 #: The remainder is worth deploying where it adds this much to the logarithm of the evidence, and this share of noise
-#: and own error.
+#: and own error; where nothing is known of the paths, so are named effects in place of all channels.
 WORTH, LEAST = 2.0 * MARGIN, 0.5
 #: A fitted path has no more lags than this, and fewer where this share of its step response is all that it loses.
 PATH_LAGS, PATH_EXACT = 4, 0.003
@@ -147,7 +147,9 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.criterion.charge(fit):
+    # Where nothing is known of the paths, the names carry the whole deformation into states that were not seen.
+    charge = search.criterion.charge(fit) + WORTH * evidence.free_paths
+    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - charge:
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)

@@ -165,8 +165,10 @@ class Points:
 
     def _typical_logs(self, stride: int) -> Vector:
         noise_um = self.evidence.probe_um / math.sqrt(stride)
-        if not self.is_exact:
-            # What a calibration missed is no slow process: it is largest right after the heat is switched.
+        # What a calibration or the form of a path misses is no slow process: it is largest right after a change.
+        if self.evidence.free_paths:
+            noise_um = math.hypot(noise_um, FORM_ERROR[True] * self.spread_um)
+        elif not self.is_exact:
             noise_um = math.hypot(noise_um, self.own_um)
         slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
         return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, START_SHARE * self.spread_um, self.own_um])

@@ -35,6 +35,8 @@ class Pair:
         Largest magnitude of the correlation of one of them with another probe; 0 without one.
     ratio : float
         How far the second moves where the first moves by 1.
+    apart_um : float
+        How far they move apart within a record, µm.
     share : bool
         Whether the data permit common time constants.
     """
@@ -44,6 +46,7 @@ class Pair:
     correlation: float
     others: float
     ratio: float
+    apart_um: float
     share: bool
 
     @property
@@ -68,7 +71,7 @@ def pairs(
     """Yield the probes that are probably pairs.
 
     Where three move alike, which of them are a pair does not show, and none is proposed. Axes of a control have
-    directions of their own, so they are no pair of each other.
+    directions of their own, so they are no pair of each other; the slope of an axis, such as `y_slope`, is no probe.
 
     Parameters
     ----------
@@ -86,7 +89,7 @@ def pairs(
     [('a', 'b')]
     """
     lag = max(1, round(CHANGE_MIN * 60.0 / period_s))
-    probes = {name: values for name, values in measured.items() if name not in AXES}
+    probes = {name: values for name, values in measured.items() if name.removesuffix("_slope") not in AXES}
     changes = {name: np.concatenate([v[lag:] - v[:-lag] for v in values]) for name, values in probes.items()}
     found: dict[frozenset[str], tuple[float, float]] = {}
     for first, second in itertools.combinations(changes, 2):
@@ -106,5 +109,11 @@ def pairs(
                 correlation=correlation,
                 others=max(beside, default=0.0),
                 ratio=ratio,
+                apart_um=max(_span(a - b) for a, b in zip(probes[first], probes[second], strict=True)),
                 share=any(first in group and second in group for group in shared),
             )
+
+
+def _span(values: Vector) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if known.size else 0.0

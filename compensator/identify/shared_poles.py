@@ -3,9 +3,9 @@
 The outputs of all axes are fitted together with the same poles; amplitudes, initial states and zeros stay those of each
 axis. Each residual counts by its standard deviation in the fit of its axis alone, at low frequencies.
 
-Axes share their time constants where the data do not contradict: on held-out blocks of time no axis has an error that
-is larger than that of its own fit, by the criterion that also chooses the order (`choice.no_worse`). By chance one of
-six axes with the same time constants would fail it, so a negligible difference is not one.
+Axes share their time constants where the data do not contradict: on held-out blocks of time no axis has a larger error
+than by its own fit, apart from a negligible difference. The criterion that chooses the order (`choice.no_worse`) does
+not serve here: few blocks that differ much permit an error that is larger by a seventh.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.calibration import Calibration, with_deformation
-from compensator.identify.choice import Candidate, folds_of, no_worse
+from compensator.identify.choice import Candidate, folds_of
 from compensator.identify.output_error import (
     OutputErrorFit,
     Segment,
@@ -243,8 +243,7 @@ def _shared(outputs: Mapping[str, Output], period_s: float, folds: int) -> Share
 
 def _agrees(together: Candidate, alone: Candidate) -> bool:
     """Whether the data of an axis permit the common time constants."""
-    is_small = together.rms <= (1.0 + NEGLIGIBLE) * alone.rms
-    return together.supported and (is_small or no_worse(together.fold_rms, alone.fold_rms))
+    return together.supported and together.rms <= (1.0 + NEGLIGIBLE) * alone.rms
 
 
 def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: float, folds: int) -> Shared:

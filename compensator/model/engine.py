@@ -21,6 +21,7 @@ from compensator.errors import ModelError
 from compensator.model.effects import EffectStream, Signals
 from compensator.model.late_observer import observer_of
 from compensator.model.observer import Forecast, ObserverState
+from compensator.model.outputs import OutputEstimate
 from compensator.model.thermal_model import ThermalModel
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
@@ -62,6 +63,8 @@ class Estimate:
         state of their own, µm.
     y_rate_um_per_min : float
         Growth over the next sample, with heat and ambient as they are, µm/min.
+    outputs : tuple of OutputEstimate
+        Further outputs of the model.
     """
 
     heat_w: float
@@ -72,6 +75,7 @@ class Estimate:
     y_um: float
     y_std_um: float
     y_rate_um_per_min: float
+    outputs: tuple[OutputEstimate, ...] = ()
 
     @property
     def contributions_um(self) -> tuple[float, ...]:
@@ -110,7 +114,7 @@ class EngineState:
     observer : ObserverState
         State of the observer.
     effects : tuple of tuple of float
-        State of each effect.
+        State of each effect, those of further parts of the model after those of the first.
     channels : tuple of (str, float)
         Last good value of each channel that an effect uses.
     reference : Reference
@@ -155,6 +159,27 @@ class Gap:
     held: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A part of the model with its effects, and those of them that state a variance."""
+
+    model: ThermalModel
+    effects: list[EffectStream]
+    uncertain: list[EffectStream]
+
+
+@dataclass(frozen=True, slots=True)
+class _PartEstimate:
+    """What a part of the model gives after a sample; its variance is without that of sensor noise."""
+
+    dtf_um: float
+    tdtf_um: float
+    effects_um: tuple[float, ...]
+    um: float
+    variance_um2: float
+    rate_um_per_min: float
+
+
 class Engine:
     """Runs a thermal model over samples.
 
@@ -183,9 +208,11 @@ class Engine:
         self.model = model
         self.bridge_samples = bridge_samples
         self._observer = observer_of(model)
+        self._period_min = model.period_s / 60.0
         self._start_effects()
         self.channels = model.channels
-        self._period_min = model.period_s / 60.0
+        numbers = {part.axis: i for i, part in enumerate((model, *model.parts))}
+        self._outputs = [[(numbers[name], weight) for name, weight in output.weights] for output in model.outputs]
         absolute = model.inputs == "absolute"
         self._reference = Reference(0.0, 0.0) if absolute else Reference(NAN, NAN)
         self._held: dict[str, float] = {}
@@ -233,8 +260,11 @@ class Engine:
         self._last_complete = self._gap = None
 
     def _start_effects(self) -> None:
-        self._effects = [EffectStream(effect, self.model.period_s / 60.0) for effect in self.model.effects]
-        self._uncertain = [stream for stream in self._effects if stream.effect.has_variance]
+        self._parts: list[_Part] = []
+        for model in (self.model, *self.model.parts):
+            effects = [EffectStream(effect, self._period_min) for effect in model.effects]
+            self._parts.append(_Part(model, effects, [stream for stream in effects if stream.effect.has_variance]))
+        self._effects = [stream for part in self._parts for stream in part.effects]
 
     def snapshot(self) -> EngineState:
         """Return the state after the last sample."""
@@ -425,40 +455,71 @@ class Engine:
         observer.step(inputs.t_q_k, inputs.at_k, extra_t_q_k2=extra_t_q_k2, extra_at_k2=extra_at_k2)
         if unknown is not None:
             observer.widen(unknown)
-        dtf, tdtf = observer.shares_um()
-        shares = self._step_effects(inputs, dtf, tdtf) if self._effects else ()
-        y = dtf + tdtf
-        for share in shares:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
-            y += share
-        dtf_ahead, tdtf_ahead = observer.shares_ahead_um()
-        rate = (dtf_ahead + tdtf_ahead - dtf - tdtf) / self._period_min
         if self._effects:
-            rate += self._effects_rate(dtf_ahead, tdtf_ahead, shares)
-        variance = observer.y_variance_um2 + self.model.y_std_um**2
-        for effect in self._uncertain:
-            variance += effect.variance_um2()
-        # What the effects of one direction leave open together; fsum rounds once, so the bits are the same everywhere.
-        for changes in itertools.zip_longest(*(effect.deviations_um for effect in self._effects), fillvalue=0.0):
-            variance += math.fsum(changes) ** 2
+            self._hold_channels(inputs)
+        ahead = observer.ahead()
+        first, *further = (self._advance_part(number, part, ahead) for number, part in enumerate(self._parts))
         heat = self.model.kind == "heat"
         return Estimate(
             heat_w=observer.drive if heat else NAN,
             heat_std_w=observer.drive_std if heat else NAN,
-            y_dtf_um=dtf,
-            y_tdtf_um=tdtf,
-            y_effects_um=shares,
-            y_um=y,
-            y_std_um=math.sqrt(variance),
-            y_rate_um_per_min=rate,
+            y_dtf_um=first.dtf_um,
+            y_tdtf_um=first.tdtf_um,
+            y_effects_um=first.effects_um,
+            y_um=first.um,
+            y_std_um=math.sqrt(first.variance_um2),
+            y_rate_um_per_min=first.rate_um_per_min,
+            outputs=self._output_estimates((first, *further)) if self._outputs else (),
         )
 
-    def _step_effects(self, inputs: Inputs, dtf: float, tdtf: float) -> tuple[float, ...]:
-        """Step every effect; a channel that is missing keeps its last good value."""
+    def _advance_part(self, number: int, part: _Part, ahead: list[float]) -> _PartEstimate:
+        """Step the effects of a part of the model; `ahead` is the observer's state one sample ahead."""
+        observer = self._observer
+        dtf, tdtf = observer.shares_of(number, observer.x)
+        shares: tuple[float, ...] = ()
+        if part.effects:
+            signals = self._signals(dtf, tdtf)
+            shares = tuple(effect.step(signals) for effect in part.effects)
+        y = dtf + tdtf
+        for share in shares:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
+            y += share
+        dtf_ahead, tdtf_ahead = observer.shares_of(number, ahead)
+        rate = (dtf_ahead + tdtf_ahead - dtf - tdtf) / self._period_min
+        if part.effects:
+            rate += self._effects_rate(part, dtf_ahead, tdtf_ahead, shares)
+        # That of the first part includes sensor noise; outputs, which may share parts, add theirs themselves.
+        variance = (observer.y_variance_um2 if number == 0 else 0.0) + part.model.y_std_um**2
+        for effect in part.uncertain:
+            variance += effect.variance_um2()
+        # What the effects of one direction leave open together; fsum rounds once, so the bits are the same everywhere.
+        for changes in itertools.zip_longest(*(effect.deviations_um for effect in part.effects), fillvalue=0.0):
+            variance += math.fsum(changes) ** 2
+        return _PartEstimate(dtf, tdtf, shares, y, variance, rate)
+
+    def _output_estimates(self, parts: Sequence[_PartEstimate]) -> tuple[OutputEstimate, ...]:
+        """Return the further outputs, each a weighted sum of parts."""
+        found = []
+        for weights, noise in zip(self._outputs, self._observer.output_variances, strict=True):
+            dtf = tdtf = value = rate = 0.0
+            effects: list[float] = []
+            variance = noise
+            for number, weight in weights:
+                part = parts[number]
+                dtf += weight * part.dtf_um
+                tdtf += weight * part.tdtf_um
+                value += weight * part.um
+                rate += weight * part.rate_um_per_min
+                effects += [weight * share for share in part.effects_um]
+                own = part.variance_um2 - (self._observer.y_variance_um2 if number == 0 else 0.0)
+                variance += weight * weight * own
+            found.append(OutputEstimate(dtf, tdtf, tuple(effects), value, math.sqrt(max(variance, 0.0)), rate))
+        return tuple(found)
+
+    def _hold_channels(self, inputs: Inputs) -> None:
+        """Keep what the channels show; one that is missing keeps its last good value."""
         for name, value in inputs.channels.items():
             if not math.isnan(value):
                 self._held[name] = value
-        signals = self._signals(dtf, tdtf)
-        return tuple(effect.step(signals) for effect in self._effects)
 
     def _signals(self, dtf: float, tdtf: float) -> Signals[float]:
         observer = self._observer
@@ -466,11 +527,11 @@ class Engine:
             drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held
         )
 
-    def _effects_rate(self, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
-        """Return the growth of the effects over the next sample, from the signals ahead, µm/min."""
+    def _effects_rate(self, part: _Part, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
+        """Return the growth of a part's effects over the next sample, from the signals ahead, µm/min."""
         signals = self._signals(dtf_ahead, tdtf_ahead)
         growth = 0.0
-        for effect, share in zip(self._effects, shares, strict=True):
+        for effect, share in zip(part.effects, shares, strict=True):
             growth += effect.peek(signals) - share
         return growth / self._period_min
 

@@ -9,6 +9,8 @@ T_Q − AT, K, in a direct model) and the ambient change *a* as random walks:
     y      = C₂ x₂ + D₂ q + C₃ x₃ + D₃ a
 
 The fourth path leads from the ambient to T_Q: 1, or the lag of a late T_Q, which is then in the first path, too.
+Further parts of a model, such as those of other axes, add a DTF and a TDTF each, driven by the same *q* and *a*;
+nothing leads from them to T_Q, so they leave the estimates of the others as they are.
 
 Both ways to estimate the heat are observers of this system; only their gains differ:
 
@@ -111,12 +113,21 @@ class Observer:
         self._kalman = estimator.method == "kalman"
         self._r_tq = estimator.t_q_noise_std_k**2
         self._r_at = estimator.at_noise_std_k**2
-        self._lay_out(ttf, model.dtf.sampled, tdtf, ambient)
+        further = [
+            function
+            for part in model.parts
+            for function in (part.dtf.sampled, part.tdtf.sampled if part.tdtf else _ZERO)
+        ]
+        self._lay_out(ttf, model.dtf.sampled, tdtf, ambient, *further)
+        self._outputs = self._output_rows(model)
         self._walk = np.zeros(self.size)
         self._walk[self._q] = estimator.drive_walk_std**2
         self._walk[self._a] = estimator.at_walk_std_k**2
-        self._diagonal = np.arange(self.size)
-        self._upper = np.triu_indices(self.size)
+        upper, right = np.triu_indices(self.size)
+        self._upper, self._lower = upper * self.size + right, right * self.size + upper
+        #: States of y and their weights.
+        weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
+        self._of_y = [(index, weight) for index, weight in weights if index < self.size]
         self.reset()
 
     def _lay_out(self, *functions: SampledTransferFunction) -> None:
@@ -129,7 +140,8 @@ class Observer:
         self._d: list[float] = []
         rows: list[tuple[int, int, int, float, float]] = []
         start = 0
-        for function, source in zip(functions, (self._q, self._q, self._a, self._a), strict=True):
+        sources = (self._q, self._q, self._a, self._a) + (self._q, self._a) * ((len(functions) - 4) // 2)
+        for function, source in zip(functions, sources, strict=True):
             a, b, d = function.observer_form()
             n = function.order
             self._first.append(start if n else nil)
@@ -142,6 +154,24 @@ class Observer:
         self._next_row, self._first_row, self._source_row = next_row, first_row, source_row
         self._a_column, self._b_column = a_column[:, None], b_column[:, None]
 
+    def _paths_of(self, part: int) -> tuple[int, int]:
+        """Return the numbers of DTF and TDTF of a part of the model; 0 is the first."""
+        return (1, 2) if part == 0 else (2 * part + 2, 2 * part + 3)
+
+    def _output_rows(self, model: ThermalModel) -> list[list[tuple[int, float]]]:
+        """Return for each further output the states that it consists of, with their factors."""
+        numbers = {part.axis: i for i, part in enumerate((model, *model.parts))}
+        rows = []
+        for output in model.outputs:
+            row: dict[int, float] = {}
+            for name, weight in output.weights:
+                for path, source in zip(self._paths_of(numbers[name]), (self._q, self._a), strict=True):
+                    for index, factor in ((self._first[path], 1.0), (source, self._d[path])):
+                        if index < self.size:
+                            row[index] = row.get(index, 0.0) + weight * factor
+            rows.append(list(row.items()))
+        return rows
+
     def reset(self) -> None:
         """Return to rest: every state zero and known."""
         self._x = [0.0] * (self.size + 1)
@@ -150,6 +180,8 @@ class Observer:
         self._started = False
         self._steady: tuple[list[float], list[float]] = ([], [])
         self._y_var = 0.0
+        #: Variances of the further outputs; None where the covariance has changed since.
+        self._output_vars: list[float] | None = None
 
     # ------------------------------------------------------------------ one sample
 
@@ -230,7 +262,7 @@ class Observer:
         if r_tq is not None:
             gain_tq, p = self._update_t_q(p, r_tq)
         self._P = p
-        self._y_var = self._variance_of_y()
+        self._y_var, self._output_vars = self._variance_of_y(), None
         self._settled = complete and self._started and self._has_settled(before)
         if self._settled:
             self._steady = self._steady_gains()
@@ -243,17 +275,18 @@ class Observer:
         return gain_at, gain_tq
 
     def _f_times(self, matrix: Matrix) -> Matrix:
-        rows = np.vstack((matrix, np.zeros((1, self.size))))
-        product: Matrix = (
-            rows[self._next_row] - self._a_column * rows[self._first_row] + self._b_column * rows[self._source_row]
-        )
+        rows = np.zeros((self.size + 1, self.size))
+        rows[:-1] = matrix
+        following, first, source = (rows.take(of, axis=0) for of in (self._next_row, self._first_row, self._source_row))
+        product: Matrix = following - self._a_column * first + self._b_column * source
         return product
 
     def _moved_covariance(self, p: Matrix) -> Matrix:
         moved = self._f_times(self._f_times(p).T)
         # Symmetric to the bit, because a snapshot keeps the upper triangle only.
-        moved.T[self._upper] = moved[self._upper]
-        moved[self._diagonal, self._diagonal] += self._walk
+        flat = moved.reshape(-1)
+        flat[self._lower] = flat[self._upper]
+        flat[:: self.size + 1] += self._walk
         return moved
 
     def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
@@ -287,26 +320,15 @@ class Observer:
         return gain.tolist(), _corrected(p, gain, column, s)
 
     def _has_settled(self, before: Matrix) -> bool:
-        deviation = np.sqrt(np.maximum(self._P[self._diagonal, self._diagonal], 0.0))
+        deviation = np.sqrt(np.maximum(self._P.diagonal(), 0.0))
+        # The variances alone show most of the way that it has not.
+        if np.any(np.abs(self._P.diagonal() - before.diagonal()) > SETTLED * (deviation * deviation)):
+            return False
         scale = np.multiply.outer(deviation, deviation)
         return bool(np.all(np.abs(self._P - before) <= SETTLED * scale))
 
     def _variance_of_y(self) -> float:
-        terms = [
-            (index, weight)
-            for index, weight in (
-                (self._first[1], 1.0),
-                (self._q, self._d[1]),
-                (self._first[2], 1.0),
-                (self._a, self._d[2]),
-            )
-            if index < self.size
-        ]
-        total = 0.0
-        for i, wi in terms:
-            for j, wj in terms:
-                total += wi * wj * float(self._P[i, j])
-        return max(total, 0.0)
+        return _variance(self._of_y, self._P.tolist())
 
     # ------------------------------------------------------------------ estimates
 
@@ -350,17 +372,27 @@ class Observer:
         """Variance of y that sensor noise and missing samples cause, µm²."""
         return self._y_var
 
+    @property
+    def output_variances(self) -> list[float]:
+        """Variance of each further output that sensor noise and missing samples cause, in its unit squared."""
+        if self._output_vars is None:
+            covariance = self._P.tolist()
+            self._output_vars = [_variance(row, covariance) for row in self._outputs]
+        return self._output_vars
+
     def shares_um(self) -> tuple[float, float]:
         """Return the shares of DTF and TDTF in y, µm."""
-        return self._shares(self._x)
+        return self.shares_of(0, self._x)
 
-    def shares_ahead_um(self) -> tuple[float, float]:
-        """Return the shares one sample ahead, with drive and ambient as they are, µm."""
-        return self._shares(self._moved(self._x))
+    def ahead(self) -> list[float]:
+        """Return the state vector one sample ahead, with drive and ambient as they are, and a zero."""
+        return self._moved(self._x)
 
-    def _shares(self, x: list[float]) -> tuple[float, float]:
-        dtf = x[self._first[1]] + self._d[1] * x[self._q]
-        tdtf = x[self._first[2]] + self._d[2] * x[self._a]
+    def shares_of(self, part: int, x: list[float]) -> tuple[float, float]:
+        """Return the shares of DTF and TDTF of a part of the model in a state, µm; part 0 gives y."""
+        first, second = self._paths_of(part)
+        dtf = x[self._first[first]] + self._d[first] * x[self._q]
+        tdtf = x[self._first[second]] + self._d[second] * x[self._a]
         return dtf, tdtf
 
     # ------------------------------------------------------------------ after a gap
@@ -388,7 +420,7 @@ class Observer:
         gain = column / s
         walked, walked_var = self._P, self._y_var
         self._P = _corrected(p, gain, column, s)
-        self._y_var = self._variance_of_y()
+        self._y_var, self._output_vars = self._variance_of_y(), None
         if self._y_var > walked_var:
             self._settled = False
         else:
@@ -400,7 +432,7 @@ class Observer:
         """Return what must be kept to continue from here with the same bits."""
         return ObserverState(
             x=tuple(self._x[: self.size]),
-            p=tuple(self._P[self._upper].tolist()),
+            p=tuple(self._P.take(self._upper).tolist()),
             settled=self._settled,
             started=self._started,
         )
@@ -413,14 +445,23 @@ class Observer:
         ValueError
             If the snapshot belongs to a model of another size.
         """
-        if len(state.x) != self.size or len(state.p) != self._upper[0].size:
+        if len(state.x) != self.size or len(state.p) != self._upper.size:
             raise ValueError(f"snapshot of {len(state.x)} states, the model has {self.size}")
         self._x = [*state.x, 0.0]
         self._P = np.zeros((self.size, self.size))
-        self._P[self._upper] = state.p
-        self._P.T[self._upper] = state.p
+        flat = self._P.reshape(-1)
+        flat[self._upper] = flat[self._lower] = state.p
         self._started = state.started
-        self._y_var = self._variance_of_y()
+        self._y_var, self._output_vars = self._variance_of_y(), None
         self._settled = state.settled
         if state.settled:
             self._steady = self._steady_gains()
+
+
+def _variance(terms: list[tuple[int, float]], covariance: list[list[float]]) -> float:
+    """Return the variance of a sum of states with their weights."""
+    total = 0.0
+    for i, wi in terms:
+        for j, wj in terms:
+            total += wi * wj * covariance[i][j]
+    return max(total, 0.0)

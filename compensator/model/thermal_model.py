@@ -25,6 +25,7 @@ from compensator.display import Shown, Table, Words, with_std
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
 from compensator.model.effects.lateness import Lateness
+from compensator.model.outputs import Output
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
 
 Kind = Literal["heat", "direct"]
@@ -160,6 +161,10 @@ class ThermalModel(Shown):
         Hash of the model file's bytes; empty for a model that was not read from a file.
     axis : str
         The axis whose deformation it gives.
+    parts : tuple of ThermalModel
+        Further parts that the same heat and ambient drive; only in a service of several axes.
+    outputs : tuple of Output
+        Further outputs, made of its own part, which has the name of its axis, and of those.
     """
 
     name: str
@@ -178,6 +183,8 @@ class ThermalModel(Shown):
     provenance: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
     axis: str = FIRST
+    parts: tuple[ThermalModel, ...] = ()
+    outputs: tuple[Output, ...] = ()
 
     def __post_init__(self) -> None:
         check_runnable(self)
@@ -199,8 +206,9 @@ class ThermalModel(Shown):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Logged channels that its effects need, each once."""
-        return tuple(dict.fromkeys(channel for effect in self.effects for channel in effect.measured))
+        """Logged channels that its effects need, those of all parts, each once."""
+        own = (channel for effect in self.effects for channel in effect.measured)
+        return tuple(dict.fromkeys([*own, *(channel for part in self.parts for channel in part.channels)]))
 
     @property
     def late_t_q(self) -> Lateness | None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-import threading
+import time
 
+from .axes_receiver import AxesReceiver
+from .axes_settings import AxesSettings, load_any
 from .errors import ReceiverError
-from .settings import load_settings
 from .subscriber import Receiver
 
 
@@ -21,20 +22,22 @@ def main() -> int:
     )
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with a table [receiver]")
     arguments = parser.parse_args()
-    ended = threading.Event()
+    # No threading.Event: a handler that sets it while this thread waits for it could wait for its lock for ever.
+    ended: list[int] = []
     signals = (signal.SIGINT, signal.SIGTERM)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # who starts a program may have blocked them
     for number in signals:
-        signal.signal(number, lambda *_: ended.set())
+        signal.signal(number, lambda number, _: ended.append(number))
     try:
-        settings, _ = load_settings(arguments.config)
-        receiver = Receiver(settings)
+        settings, _ = load_any(arguments.config)
+        receiver = AxesReceiver(settings) if isinstance(settings, AxesSettings) else Receiver(settings)
     except ReceiverError as error:
         sys.stderr.write(f"compensator.receiver: {error}\n")
         return error.exit_code
     reported: object = None
     with receiver:
-        while not ended.wait(0.1):
+        while not ended:
+            time.sleep(0.1)
             applied = receiver.poll()
             # A changed figure in a detail (an age, a distance) does not cause a new line.
             shown = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))

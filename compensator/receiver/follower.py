@@ -8,61 +8,15 @@ interruption of the program for an hour cannot make the offset jump.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from .errors import ReceiverError
+from .gate import Gate
+from .limits import Limits
 from .message import OffsetMessage, Rejected, parse_offset
-from .reasons import Reason, printable
-from .restart import CountRestart
-
-#: Part of `valid_for_s` for which the published rate is followed: the rate holds until the next sample, and a message
-#: is valid for two to three samples.
-RATE_PART = 0.5
-#: Closer than this the offset counts as arrived, µm.
-ARRIVED_UM = 0.01
-#: Largest value of each limit: more is a slip of the pen, and no limit at all.
-LARGEST: Mapping[str, float] = {
-    "offset_max_um": 5000.0,
-    "offset_rate_max_um_per_min": 6000.0,
-    "valid_max_s": 10_000.0,
-    "step_max_s": 120.0,
-    "clock_tolerance_s": 600.0,
-}
-
-FollowerState = Literal["starting", "following", "holding", "fading"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """Limits of the applied offset; each at most the value in `LARGEST`.
-
-    Parameters
-    ----------
-    offset_max_um : float
-        Largest offset, µm. A message beyond it is dropped.
-    offset_rate_max_um_per_min : float
-        Largest rate, µm/min.
-    valid_max_s : float
-        Longest time that a message may be used, regardless of its own validity, s.
-    step_max_s : float
-        Longest time between two calls of `advance` that counts for the movement, s.
-    clock_tolerance_s : float
-        Largest time by which a message may be ahead of the wall clock, s.
-    """
-
-    offset_max_um: float
-    offset_rate_max_um_per_min: float
-    valid_max_s: float = 600.0
-    step_max_s: float = 1.0
-    clock_tolerance_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name, largest in LARGEST.items():
-            value = getattr(self, name)
-            if not 0.0 < value <= largest:
-                raise ReceiverError(f"{name} = {value}: expected a number above 0, at most {largest:g}")
+from .modes import ARRIVED_UM, FollowerState, Modes, followed_s, moved
+from .reasons import Reason, steady
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,21 +58,10 @@ class Applied:
     @property
     def steady_reasons(self) -> str:
         """Return the reasons without the figures that change at every call, for logs that report changes only."""
-        changing = ("catching_up", "expired")
-        return " ".join((Reason(r.code) if r.code in changing else r).marked for r in self.reasons)
+        return steady(self.reasons)
 
 
-@dataclass(slots=True)
-class _Held:
-    """The newest message, and when it was measured on the monotonic clock."""
-
-    message: OffsetMessage
-    measured_s: float
-    valid_s: float
-
-
-@dataclass(slots=True)
-class Follower:
+class Follower(Modes[OffsetMessage]):
     """Follows one machine's offset.
 
     Parameters
@@ -150,44 +93,11 @@ class Follower:
     +1.90 µm, following: The offset is still moving to its value at the permitted rate. (to -12.00 µm) [catching_up]
     """
 
-    machine: str
-    limits: Limits
-    applied_um: float = 0.0
-    last_sequence: int = -1
-    alive: bool | None = None
-    dropped: dict[str, int] = field(default_factory=dict)
-    _held: _Held | None = None
-    _rejected: Reason | None = None
-    _mode: Literal["follow", "hold", "fade"] = "follow"
-    _fade_rate_um_per_min: float = 0.0
-    _advanced_s: float | None = None
-    _restart: CountRestart = field(default_factory=CountRestart)
-    _restarted: Reason | None = None
-
-    def __post_init__(self) -> None:
-        self.rebase(self.applied_um)
-
-    # ------------------------------------------------------------------ modes
-
-    def follow(self) -> None:
-        """Follow the machine, again after `hold` or `fade`."""
-        self._mode = "follow"
-
-    def hold(self) -> None:
-        """Freeze the offset at its present value."""
-        self._mode = "hold"
-
-    def fade(self, rate_um_per_min: float) -> None:
-        """Move the offset to zero, at this rate but never faster than the limit.
-
-        Raises
-        ------
-        ReceiverError
-            Where the rate is not above 0.
-        """
-        if not (math.isfinite(rate_um_per_min) and rate_um_per_min > 0.0):
-            raise ReceiverError(f"fade rate = {rate_um_per_min} µm/min: expected a number above 0")
-        self._mode, self._fade_rate_um_per_min = "fade", rate_um_per_min
+    def __init__(self, machine: str, limits: Limits, applied_um: float = 0.0, last_sequence: int = -1) -> None:
+        super().__init__(Gate(machine, limits, self._check_size, last_sequence))
+        self.limits = limits
+        self.applied_um = 0.0
+        self.rebase(applied_um)
 
     def rebase(self, applied_um: float) -> None:
         """Continue from the offset that the control applies, if it differs from the last one.
@@ -240,66 +150,15 @@ class Follower:
             message = parse_offset(payload)
             if utc_ns is not None:
                 age_s = (utc_ns() - message.time_utc_ns) / 1e9
-            accepted = self._check(now_s, message, age_s, asked)
+            return self._gate.accept(now_s, message, age_s, asked=asked)
         except Rejected as rejected:
-            self._rejected = rejected.reason
-            self.dropped[rejected.reason.code] = self.dropped.get(rejected.reason.code, 0) + 1
+            self._gate.reject(rejected.reason)
             return False
-        if not accepted:
-            return False
-        self._restarted = None
-        if message.seq < self.last_sequence:
-            self._restarted = Reason("count_restarted", f"number {message.seq} after {self.last_sequence}")
-        self._restart.clear()
-        self._held = _Held(message, now_s - max(age_s or 0.0, 0.0), self._valid_s(message))
-        self.last_sequence = message.seq
-        self._rejected = None
-        return True
 
-    def _valid_s(self, message: OffsetMessage) -> float:
-        return min(message.valid_for_s, self.limits.valid_max_s)
-
-    def _check(self, now_s: float, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
-        if message.machine != self.machine:
-            raise Rejected(Reason("other_machine", f"{printable(message.machine, 64)}, expected {self.machine}"))
-        # The query at the start may return a message twice. After a restart the newest one may be queried again; its
-        # age is checked as for any other message.
-        again = message.seq == self.last_sequence
-        if again and (self._held is not None or not asked):
-            if self._held is not None and message == self._held.message:
-                return False
-            raise Rejected(Reason("replayed", f"number {message.seq} was used before"))
-        if message.seq < self.last_sequence:
-            if asked:
-                return False
-            self._check_restart(now_s, message, age_s)
-        self._check_value(message, age_s)
-        return True
-
-    def _check_restart(self, now_s: float, message: OffsetMessage, age_s: float | None) -> None:
-        """Drop a message with a lower number, unless the service evidently counts from there."""
-        detail = f"number {message.seq} after {self.last_sequence}"
-        if self._held is not None and now_s - self._held.measured_s <= self._held.valid_s:
-            raise Rejected(Reason("replayed", detail))
-        try:
-            self._check_value(message, age_s)
-        except Rejected as rejected:
-            raise Rejected(Reason("replayed", detail)) from rejected
-        if not self._restart.is_shown_by(now_s, message, self._valid_s(message)):
-            raise Rejected(Reason("replayed", detail))
-
-    def _check_value(self, message: OffsetMessage, age_s: float | None) -> None:
-        if age_s is not None:
-            self._check_age(message, age_s)
+    def _check_size(self, message: OffsetMessage) -> None:
         if message.y_offset_um is not None and abs(message.y_offset_um) > self.limits.offset_max_um:
             detail = f"{message.y_offset_um:.2f} µm, expected at most {self.limits.offset_max_um:g}"
             raise Rejected(Reason("beyond_limit", detail))
-
-    def _check_age(self, message: OffsetMessage, age_s: float) -> None:
-        if not age_s >= -self.limits.clock_tolerance_s:
-            raise Rejected(Reason("clock_disagrees", f"{-age_s:.1f} s ahead of the wall clock here"))
-        if age_s > self._valid_s(message):
-            raise Rejected(Reason("late", f"{age_s:.1f} s old by the wall clock, valid for {message.valid_for_s:g} s"))
 
     # ------------------------------------------------------------------ the applied offset
 
@@ -315,22 +174,20 @@ class Follower:
         """
         if payload is not None:
             self.receive(now_s, payload)
-        elapsed_s = 0.0 if self._advanced_s is None else now_s - self._advanced_s
-        self._advanced_s = now_s
-        step_s = min(max(elapsed_s, 0.0), self.limits.step_max_s)
+        step_s = self._step_s(now_s)
         state, target_um, reasons = self._wanted(now_s)
         arrived = False
         if target_um is not None:
             rate = self.limits.offset_rate_max_um_per_min
             if state == "fading":
                 rate = min(rate, self._fade_rate_um_per_min)
-            self._move(target_um, rate * step_s / 60.0)
+            self.applied_um = moved(self.applied_um, target_um, rate * step_s / 60.0, self.limits.offset_max_um)
             arrived = abs(target_um - self.applied_um) <= ARRIVED_UM
             if state == "fading":
                 reasons.append(Reason("faded") if self.applied_um == 0.0 else Reason("fading"))
             elif not arrived:
                 reasons.append(Reason("catching_up", f"to {target_um:+.2f} µm"))
-        held = self._held
+        held = self._gate.held
         return Applied(
             offset_um=self.applied_um,
             state=state,
@@ -341,44 +198,21 @@ class Follower:
             service_state=None if held is None else held.message.state,
         )
 
-    def _move(self, target_um: float, step_um: float) -> None:
-        distance_um = target_um - self.applied_um
-        if abs(distance_um) <= step_um:
-            self.applied_um = target_um
-        else:
-            moved = self.applied_um + math.copysign(step_um, distance_um)
-            self.applied_um = max(-self.limits.offset_max_um, min(self.limits.offset_max_um, moved))
-
     def _wanted(self, now_s: float) -> tuple[FollowerState, float | None, list[Reason]]:
         """Return the state, the target of the offset (None: it is held), and the reasons so far."""
-        reasons = [reason for reason in (self._rejected, self._restarted) if reason is not None]
-        if self.alive is False:
-            reasons.append(Reason("service_gone"))
-        if self._mode == "fade":
-            return "fading", 0.0, reasons
-        if self._mode == "hold":
-            return "holding", None, [Reason("held_here"), *reasons]
-        held = self._held
+        state, held, reasons = self._state(now_s)
         if held is None:
-            return "starting", None, [Reason("no_message"), *reasons]
-        message, age_s = held.message, now_s - held.measured_s
+            return state, 0.0 if state == "fading" else None, reasons
+        message = held.message
         codes = ", ".join(message.reasons)
-        if age_s > held.valid_s:
-            return "holding", None, [Reason("expired", f"{age_s:.0f} s old, valid for {held.valid_s:g} s"), *reasons]
         if not message.usable or message.y_offset_um is None:
             return "holding", None, [Reason(f"service_{message.state}", codes), *reasons]
         if message.state == "degraded":
             reasons.append(Reason("service_degraded", codes))
-        followed_s = max(0.0, min(age_s, RATE_PART * held.valid_s))
-        target_um = message.y_offset_um + message.y_offset_rate_um_per_min * followed_s / 60.0
+        reasons.extend(message.unused)
+        target_um = message.y_offset_um + message.y_offset_rate_um_per_min * followed_s(now_s, held) / 60.0
         largest = self.limits.offset_max_um
         if abs(target_um) > largest:
             target_um = math.copysign(largest, target_um)
             reasons.append(Reason("limit_reached", f"{largest:g} µm"))
-        return "following", target_um, reasons
-
-    # ------------------------------------------------------------------ over a restart
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return what must survive a restart."""
-        return {"machine": self.machine, "last_sequence": self.last_sequence}
+        return state, target_um, reasons

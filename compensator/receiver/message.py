@@ -15,6 +15,8 @@ SCHEMA = 1
 PAYLOAD_MAX_BYTES = 65_536
 #: Largest number of a message: ten samples a second for 300 years.
 SEQ_MAX = 100_000_000_000
+#: Axes and angles that a service may publish besides Y.
+FURTHER = ("x", "z", "a", "b")
 _STATES = ("starting", "ok", "degraded", "hold", "fault")
 #: Number of codes in a message, and their length.
 _CODES_MAX, _CODE_LENGTH = 100, 200
@@ -57,6 +59,8 @@ class OffsetMessage:
         `starting`, `ok`, `degraded`, `hold` or `fault`.
     reasons : tuple of str
         The service's codes.
+    unused : tuple of Reason
+        What the service publishes besides and a receiver of Y alone does not apply.
     """
 
     machine: str
@@ -67,6 +71,7 @@ class OffsetMessage:
     y_offset_rate_um_per_min: float
     state: str
     reasons: tuple[str, ...]
+    unused: tuple[Reason, ...] = ()
 
     @property
     def usable(self) -> bool:
@@ -82,36 +87,90 @@ def parse_offset(payload: bytes) -> OffsetMessage:
     Rejected
         `malformed` or `other_schema`.
     """
-    table = _decode(payload)
-    _check_schema(table)
+    table = decode(payload)
+    head = header_of(table)
+    offset_um, rate = value_of(table, "y_offset", "um")
+    return OffsetMessage(
+        y_offset_um=offset_um,
+        y_offset_rate_um_per_min=rate,
+        unused=_unused(table),
+        **head,
+        **number_of(table),
+    )
+
+
+def _unused(table: dict[str, Any]) -> tuple[Reason, ...]:
+    """Return what the message says of further axes and of a slope, as far as it says it as a service does."""
+    axes = table.get("axes")
+    known = axes if isinstance(axes, list) and len(axes) <= len(FURTHER) + 1 else []
+    further = [axis for axis in FURTHER if axis in known]
+    found = [Reason("further_axes", ", ".join(further))] if further else []
+    if table.get("y_slope_um_per_m") is not None:
+        found.append(Reason("slope_not_applied"))
+    return tuple(found)
+
+
+def header_of(table: dict[str, Any]) -> dict[str, Any]:
+    """Check what every offset has but its number, and return it by the names of the fields of a message.
+
+    Raises
+    ------
+    Rejected
+        As `parse_offset`.
+    """
+    check_schema(table)
     state = table.get("state")
     if state not in _STATES:
-        raise _malformed("state", state, f"one of {', '.join(_STATES)}")
+        raise malformed("state", state, f"one of {', '.join(_STATES)}")
     machine = table.get("machine")
     if not isinstance(machine, str) or not machine:
-        raise _malformed("machine", machine, "a name")
+        raise malformed("machine", machine, "a name")
     reasons = table.get("reasons")
     if not isinstance(reasons, list) or len(reasons) > _CODES_MAX or not all(map(_is_code, reasons)):
-        raise _malformed("reasons", reasons, "a list of codes")
-    valid_for_s = _number(table, "valid_for_s")
+        raise malformed("reasons", reasons, "a list of codes")
+    return {
+        "machine": machine,
+        "valid_for_s": seconds(table),
+        "state": state,
+        "reasons": tuple(reasons),
+    }
+
+
+def number_of(table: dict[str, Any]) -> dict[str, Any]:
+    """Return number and time of a message by the names of its fields."""
+    return {"seq": integer(table, "seq", SEQ_MAX), "time_utc_ns": integer(table, "time_utc_ns")}
+
+
+def seconds(table: dict[str, Any]) -> float:
+    """Return `valid_for_s`, above 0."""
+    valid_for_s = number(table, "valid_for_s")
     if valid_for_s is None or valid_for_s <= 0.0:
-        raise _malformed("valid_for_s", valid_for_s, "seconds above 0")
-    offset_um, rate = _number(table, "y_offset_um"), _number(table, "y_offset_rate_um_per_min")
-    if offset_um is None and state in ("ok", "degraded"):
-        raise _malformed("y_offset_um", None, f"a number in state {state}")
-    std_um = _number(table, "y_offset_std_um")
-    if std_um is not None and std_um < 0.0:
-        raise _malformed("y_offset_std_um", std_um, "0 or more")
-    return OffsetMessage(
-        machine=machine,
-        seq=_integer(table, "seq", SEQ_MAX),
-        time_utc_ns=_integer(table, "time_utc_ns"),
-        valid_for_s=valid_for_s,
-        y_offset_um=offset_um,
-        y_offset_rate_um_per_min=rate or 0.0,
-        state=state,
-        reasons=tuple(reasons),
-    )
+        raise malformed("valid_for_s", valid_for_s, "seconds above 0")
+    return valid_for_s
+
+
+def value_of(table: dict[str, Any], name: str, unit: str) -> tuple[float | None, float]:
+    """Return a published value and its rate; the value is a number in every state that is followed.
+
+    Parameters
+    ----------
+    table : dict
+        A decoded message.
+    name, unit : str
+        Such as `y_offset` and `um`.
+
+    Raises
+    ------
+    Rejected
+        `malformed`.
+    """
+    value, rate = number(table, f"{name}_{unit}"), number(table, f"{name}_rate_{unit}_per_min")
+    if value is None and table.get("state") in ("ok", "degraded"):
+        raise malformed(f"{name}_{unit}", None, f"a number in state {table['state']}")
+    std = number(table, f"{name}_std_{unit}")
+    if std is not None and std < 0.0:
+        raise malformed(f"{name}_std_{unit}", std, "0 or more")
+    return value, rate or 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,11 +217,11 @@ def parse_status(payload: bytes, machine: str) -> StatusMessage:
     Rejected
         `malformed`, `other_schema` or `other_machine`.
     """
-    table = _decode(payload)
-    _check_schema(table)
+    table = decode(payload)
+    check_schema(table)
     if table.get("machine") != machine:
         raise Rejected(Reason("other_machine", f"{_shown(table.get('machine'))}, expected {machine}"))
-    return StatusMessage(time_utc_ns=_integer(table, "time_utc_ns"), wanted=_wanted(table))
+    return StatusMessage(time_utc_ns=integer(table, "time_utc_ns"), wanted=_wanted(table))
 
 
 def _wanted(table: dict[str, Any]) -> ProbeWanted | None:
@@ -170,17 +229,24 @@ def _wanted(table: dict[str, Any]) -> ProbeWanted | None:
     if wanted is None:
         return None
     if not isinstance(wanted, bool):
-        raise _malformed("probe_wanted", wanted, "true or false")
+        raise malformed("probe_wanted", wanted, "true or false")
     optional = {"wanted_std_um": None, "wanted_tolerance_um": None} | table
     return ProbeWanted(
         wanted=wanted,
-        by_utc_ns=None if table.get("wanted_by_ns") is None else _integer(table, "wanted_by_ns"),
-        std_um=_number(optional, "wanted_std_um"),
-        tolerance_um=_number(optional, "wanted_tolerance_um"),
+        by_utc_ns=None if table.get("wanted_by_ns") is None else integer(table, "wanted_by_ns"),
+        std_um=number(optional, "wanted_std_um"),
+        tolerance_um=number(optional, "wanted_tolerance_um"),
     )
 
 
-def _decode(payload: bytes) -> dict[str, Any]:
+def decode(payload: bytes) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Raises
+    ------
+    Rejected
+        `malformed`.
+    """
     if len(payload) > PAYLOAD_MAX_BYTES:
         raise Rejected(Reason("malformed", f"{len(payload)} bytes, expected at most {PAYLOAD_MAX_BYTES}"))
     try:
@@ -204,8 +270,15 @@ def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
-def _check_schema(table: dict[str, Any]) -> None:
-    if _integer(table, "schema") != SCHEMA:
+def check_schema(table: dict[str, Any]) -> None:
+    """Check the version of a message.
+
+    Raises
+    ------
+    Rejected
+        `other_schema`.
+    """
+    if integer(table, "schema") != SCHEMA:
         raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
 
 
@@ -213,7 +286,8 @@ def _is_code(value: object) -> bool:
     return isinstance(value, str) and len(value) <= _CODE_LENGTH and value.isprintable()
 
 
-def _malformed(key: str, value: object, expected: str) -> Rejected:
+def malformed(key: str, value: object, expected: str) -> Rejected:
+    """Return the error for a key."""
     return Rejected(Reason("malformed", f"{key} = {_shown(value)}, expected {expected}"))
 
 
@@ -224,24 +298,25 @@ def _shown(value: object) -> str:
     return printable(str(value), 40)
 
 
-def _integer(table: dict[str, Any], key: str, most: int = _INT_MAX) -> int:
+def integer(table: dict[str, Any], key: str, most: int = _INT_MAX) -> int:
+    """Return a whole number, 0 or more."""
     value = table.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
-        raise _malformed(key, value, "a whole number")
+        raise malformed(key, value, "a whole number")
     return value
 
 
-def _number(table: dict[str, Any], key: str) -> float | None:
+def number(table: dict[str, Any], key: str) -> float | None:
     """Return a finite number, or None for null; a missing key or any other value is an error."""
     value = table.get(key, "missing")
     if value is None:
         return None
     if not isinstance(value, (int, float)) or isinstance(value, bool):
-        raise _malformed(key, value, "a number or null")
+        raise malformed(key, value, "a number or null")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise _malformed(key, value, "a finite number")
+        raise malformed(key, value, "a finite number")
     return number

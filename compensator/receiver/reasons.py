@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 #: code → (meaning, action)
@@ -80,6 +80,55 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The applied offset cannot be recorded, so probes without an offset of their own are refused.",
         "Check the folder of applied_file: space, permissions, disk.",
     ),
+    "incomplete": (
+        "Not all axes of the newest sample have arrived; no axis uses it, and the previous sample is used while it is "
+        "valid.",
+        "Check that the service publishes every axis, and the access rights of the receiver.",
+    ),
+    "axes_disagree": (
+        "A sample was dropped: its axes contradict each other, or an axis was published twice.",
+        "Find out which programs publish below the prefix.",
+    ),
+    "axis_not_published": (
+        "The service does not publish an axis that this receiver applies; no axis is moved.",
+        "Compare the axes of the service and of this receiver.",
+    ),
+    "axis_not_applied": (
+        "An angle acts on an axis that this receiver does not apply; no axis is moved.",
+        "Add the table of that axis to the receiver's settings, or remove that of the angle.",
+    ),
+    "further_axes": (
+        "The service publishes further axes, which this receiver does not apply.",
+        "Add their tables to the receiver's settings if the control is to apply them.",
+    ),
+    "slope_not_applied": (
+        "The service publishes a slope over the position, which this receiver does not apply.",
+        "Set slope_max_um_per_m and the axis' travel in the receiver's settings.",
+    ),
+    "no_position": (
+        "The position of the axis is not known; the offset stays the one of the last known position.",
+        "Check that the control shows its position to the receiver.",
+    ),
+    "position_beyond": (
+        "The position is outside the travel in the settings; the offset is the one at the end of the travel.",
+        "Check position_min_mm and position_max_mm, and that the position is in machine coordinates.",
+    ),
+    "position_jumped": (
+        "The position has changed faster than the axis can move; the offset stays and moves on at the permitted rate.",
+        "Check the wiring of the position, and whether the machine was homed again.",
+    ),
+    "no_tool_length": (
+        "The length of the tool is not known; the offset is the one for the reference length.",
+        "Check that the control shows the length to the receiver.",
+    ),
+    "tool_length_beyond": (
+        "The length of the tool is outside its bounds; the offset is the one for the reference length.",
+        "Check the tool table, and length_min_mm and length_max_mm.",
+    ),
+    "tool_changed": (
+        "The tool was changed while the offset is held; for this tool the offset is wrong by the stated amount.",
+        "Wait for the service, or correct the tool by that amount.",
+    ),
     "not_connected": ("No router or service has been reached yet.", "Check address, certificates and network."),
 }
 
@@ -123,3 +172,19 @@ class Reason:
 
     def __str__(self) -> str:
         return self.text
+
+
+#: Reasons whose figures change at every call.
+_CHANGING = ("catching_up", "expired", "position_beyond", "position_jumped")
+
+
+def steady(reasons: Iterable[Reason]) -> str:
+    """Return reasons as one line of text without the figures that change at every call, each once.
+
+    Examples
+    --------
+    >>> steady([Reason("expired", "91 s old"), Reason("expired", "92 s old")]) == Reason("expired").marked
+    True
+    """
+    without = (Reason(reason.code) if reason.code in _CHANGING else reason for reason in reasons)
+    return " ".join(reason.marked for reason in dict.fromkeys(without))

@@ -8,8 +8,7 @@ faster, and a burst, do not look like that; against one that is replayed at its 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from .message import OffsetMessage
+from typing import Protocol
 
 #: Number of messages in a row that restart the count.
 MESSAGES = 3
@@ -19,11 +18,23 @@ SHORTEST_PART = 0.2
 DIFFERENCE_PART = 0.1
 
 
+class Numbered(Protocol):
+    """What is known of a message here."""
+
+    @property
+    def seq(self) -> int:
+        """Its number."""
+
+    @property
+    def time_utc_ns(self) -> int:
+        """Time of the measurement, ns since 1970 UTC."""
+
+
 @dataclass(slots=True)
 class CountRestart:
     """Looks for messages in a row whose numbers are below the last one."""
 
-    _last: OffsetMessage | None = None
+    _last: Numbered | None = None
     _received_s: float = 0.0
     _count: int = 0
 
@@ -31,14 +42,14 @@ class CountRestart:
         """Forget the messages so far."""
         self._last, self._count = None, 0
 
-    def is_shown_by(self, now_s: float, message: OffsetMessage, valid_s: float) -> bool:
+    def is_shown_by(self, now_s: float, message: Numbered, valid_s: float) -> bool:
         """Return whether the count restarts with this message.
 
         Parameters
         ----------
         now_s : float
             Arrival by the monotonic clock, s.
-        message : OffsetMessage
+        message : Numbered
             A message that is usable but for its number.
         valid_s : float
             Time for which it may be used, s.

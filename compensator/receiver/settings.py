@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .errors import ReceiverError
-from .follower import Limits
+from .limits import Acceptance, Limits
 
 T = TypeVar("T")
+S = TypeVar("S", bound="Source")
 #: Larger than any setting, and a float.
 _LARGEST = 1e30
 #: Largest files, bytes: settings, a Zenoh configuration, the state.
@@ -26,17 +27,13 @@ _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """`[receiver]`.
+class Source:
+    """What `[receiver]` has for one axis and for several: the machine, and how it is reached.
 
     Parameters
     ----------
     machine, prefix : str
         As in the service's `machine.name` and `zenoh.prefix`.
-    offset_max_um : float
-        Largest offset, µm.
-    offset_rate_max_um_per_min : float
-        Largest rate, µm/min; not below the service's, or the offset lags behind.
     connect : tuple of str
         Addresses of router or service, such as `tcp/127.0.0.1:7447`. Either this or `zenoh_config`.
     zenoh_config : str
@@ -51,13 +48,11 @@ class Settings:
     state_file : str
         Keeps the last number over a restart, so that older messages are still dropped; relative to the file.
     applied_file : str
-        Where `Receiver.record` writes the offset that the control had, for probes; relative to the file.
+        Where `record` writes the offset that the control had, for probes; relative to the file.
     """
 
     machine: str
     prefix: str
-    offset_max_um: float
-    offset_rate_max_um_per_min: float
     connect: tuple[str, ...] = ()
     zenoh_config: str = ""
     check_clock: bool = False
@@ -65,6 +60,34 @@ class Settings:
     valid_max_s: float = 600.0
     state_file: str = ""
     applied_file: str = ""
+
+    def acceptance(self, *, step_max_s: float = 1.0) -> Acceptance:
+        """Return the limits of age and clock.
+
+        Parameters
+        ----------
+        step_max_s : float
+            Longest time between two calls that counts for the movement, s.
+        """
+        return Acceptance(valid_max_s=self.valid_max_s, step_max_s=step_max_s, clock_tolerance_s=self.clock_tolerance_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings(Source):
+    """`[receiver]` of one axis.
+
+    Parameters
+    ----------
+    machine, prefix, connect, zenoh_config, check_clock, clock_tolerance_s, valid_max_s, state_file, applied_file
+        See `Source`.
+    offset_max_um : float
+        Largest offset, µm.
+    offset_rate_max_um_per_min : float
+        Largest rate, µm/min; not below the service's, or the offset lags behind.
+    """
+
+    offset_max_um: float
+    offset_rate_max_um_per_min: float
 
     def limits(self, *, step_max_s: float = 1.0) -> Limits:
         """Return the follower's limits.
@@ -101,6 +124,10 @@ def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
     table = tables.pop("receiver", None)
     if not isinstance(table, dict):
         raise ReceiverError(f"{path}: receiver: missing, expected a table [receiver]")
+    axis = tables.get("axis")
+    named = [name for name, one in axis.items() if isinstance(one, dict)] if isinstance(axis, dict) else []
+    if named:
+        raise ReceiverError(f"{path}: axis.{named[0]}: this program applies one axis; several need load_any")
     return settings_from(table, source=str(path), folder=path.parent), tables
 
 
@@ -173,17 +200,23 @@ def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None 
     ReceiverError
         As `load_settings`.
     """
-    settings = read_table(Settings, table, source=source, name="receiver")
-    _check(settings, source)
-    folder = Path() if folder is None else folder
-    absolute: dict[str, Any] = {
-        key: _absolute(folder / getattr(settings, key)) if getattr(settings, key) else ""
-        for key in ("zenoh_config", "state_file", "applied_file")
-    }
-    return replace(settings, **absolute)
+    settings = source_from(Settings, table, source=source, folder=folder)
+    try:
+        settings.limits()
+    except ReceiverError as error:
+        raise ReceiverError(f"{source}: receiver.{error}") from error
+    return settings
 
 
-def _check(settings: Settings, source: str) -> None:
+def source_from(kind: type[S], table: Mapping[str, Any], *, source: str, folder: Path | None = None) -> S:
+    """Read `[receiver]` and check what is the same for one axis and for several; paths become absolute.
+
+    Raises
+    ------
+    ReceiverError
+        As `load_settings`.
+    """
+    settings = read_table(kind, table, source=source, name="receiver")
     if not settings.machine:
         raise ReceiverError(f"{source}: receiver.machine = '': expected the service's machine.name")
     if not _PREFIX.fullmatch(settings.prefix):
@@ -193,10 +226,12 @@ def _check(settings: Settings, source: str) -> None:
             f"{source}: receiver.connect = {list(settings.connect)}: expected addresses such as "
             f"'tcp/127.0.0.1:7447' here, or a file in receiver.zenoh_config, and not both"
         )
-    try:
-        settings.limits()
-    except ReceiverError as error:
-        raise ReceiverError(f"{source}: receiver.{error}") from error
+    folder = Path() if folder is None else folder
+    absolute: dict[str, Any] = {
+        key: _absolute(folder / getattr(settings, key)) if getattr(settings, key) else ""
+        for key in ("zenoh_config", "state_file", "applied_file")
+    }
+    return replace(settings, **absolute)
 
 
 def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: str) -> T:

@@ -13,7 +13,8 @@ from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
 from compensator.errors import DataError
-from compensator.messages import MESSAGES, encode, shipped_schema
+from compensator.messages import encode, shipped_schema
+from compensator.messages_axes import ALL_MESSAGES, message_of
 from compensator.recording import chain
 from compensator.recording.container import Attachment, Contents, McapChannel
 from compensator.recording.signature import Signer
@@ -24,9 +25,10 @@ TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 TOPICS_WITH_PROBES = (*TOPICS, "probe")
 
 
-def topics_of(*, probes: bool, loop: bool) -> tuple[str, ...]:
-    """Return the topics of a machine's recording: with probes, and with another model in shadow."""
-    return (*(TOPICS_WITH_PROBES if probes else TOPICS), *(("candidate",) if loop else ()))
+def topics_of(*, probes: bool, loop: bool, axes: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the topics of a machine's recording: with probes, with another model in shadow, of several axes."""
+    further = ("offsets",) if axes else ()
+    return (*(TOPICS_WITH_PROBES if probes else TOPICS), *(("candidate",) if loop else ()), *further)
 
 
 @dataclass(slots=True)
@@ -163,13 +165,21 @@ class RecordingFile(LiveFile):
         Now, ns since 1970 UTC.
     topics : sequence of str
         Its topics.
+    axes : sequence of str
+        Axes of the machine; empty where it has Y alone.
     """
 
     def __init__(
-        self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int, topics: Sequence[str] = TOPICS
+        self,
+        paths: Iterable[Path],
+        machine: str,
+        before: bytes,
+        time_ns: int,
+        topics: Sequence[str] = TOPICS,
+        axes: Sequence[str] = (),
     ) -> None:
         super().__init__(paths)
-        self._topics = topics
+        self._topics, self._axes = topics, axes
         self.time_ns = self.sealed_ns = time_ns
         self._machine = machine
         self._channels: dict[str, int] = {}
@@ -187,7 +197,8 @@ class RecordingFile(LiveFile):
         """Write the start of the file."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
         for number, topic in enumerate(self._topics, 1):
-            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
+            name = message_of(topic, self._axes)
+            about, kind, schema = {"machine": self._machine}, ALL_MESSAGES[name].__name__, shipped_schema(name)
             contents.channels[number] = McapChannel(f"/{topic}", "json", about, kind, "jsonschema", schema)
         opening = Opening(self.writer)
         opening.write(contents)

@@ -11,12 +11,18 @@ import msgspec
 
 from compensator.errors import DataError, UsageError
 from compensator.messages import MESSAGES, Chain
+from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names_axes, topic_of
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
 
 _T = TypeVar("_T")
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
-_DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in MESSAGES.items()}
+_DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in ALL_MESSAGES.items()}
+#: Of a machine of several axes, whose messages name them.
+_DECODERS_OF_AXES: dict[str, msgspec.json.Decoder[Any]] = {
+    "offset": msgspec.json.Decoder(OFFSETS["y"]),
+    "estimate": msgspec.json.Decoder(AxesEstimate),
+}
 
 
 class RawRecord(NamedTuple):
@@ -140,7 +146,8 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: 
             topic = record.topic
             if prefix:
                 machine, _, rest = topic.rpartition("/thermal/")
-                topic = rest.removeprefix("y/") if machine == prefix else ""
+                axis, _, name = rest.rpartition("/")
+                topic = (topic_of(axis) if axis and name == "offset" else rest) if machine == prefix else ""
             if topics is None or topic in topics:
                 yield record._replace(topic=topic) if prefix else record
 
@@ -195,6 +202,8 @@ def decode(record: RawRecord, file: Path | str) -> Any:
         If it does not follow its schema.
     """
     decoder = _DECODERS.get(record.topic)
+    if record.topic in _DECODERS_OF_AXES and names_axes(record.data):
+        decoder = _DECODERS_OF_AXES[record.topic]
     if decoder is None:
         raise DataError(f"{file}: unknown channel /{record.topic}, expected one of: {', '.join(MESSAGES)}")
     return decode_with(decoder, record, str(file))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,8 @@ class McapRecorder:
         it the end of a file that a kill has left is not signed afterwards.
     topics : sequence of str
         Topics of its files.
+    axes : sequence of str
+        Axes of the machine; empty where it has Y alone.
     """
 
     def __init__(
@@ -61,12 +63,13 @@ class McapRecorder:
         signer: Signer | None = None,
         head: Path | None = None,
         topics: Sequence[str] = TOPICS,
+        axes: Sequence[str] = (),
     ) -> None:
         self._folder = folder
         self._machine = machine
         self.attachments = attachments
         self._signer = signer
-        self._topics = topics
+        self._topics, self._axes = topics, axes
         self._keeper = HeadKeeper(head, machine, signer) if head is not None and signer is not None else None
         accepted = self._keeper.accepted if self._keeper is not None else None
         self._finisher = Finisher(folder, machine, retention or Retention(), signer, accepted=accepted)
@@ -85,7 +88,7 @@ class McapRecorder:
         records: Iterable[tuple[str, bytes]],
         time_utc_ns: int,
         *,
-        state: bytes = b"",
+        state: bytes | Callable[[], bytes] = b"",
         opening: Mapping[str, bytes] | None = None,
         sync: bool = True,
     ) -> None:
@@ -97,8 +100,9 @@ class McapRecorder:
             Topic and JSON.
         time_utc_ns : int
             Time of the records, ns since 1970 UTC.
-        state : bytes
-            State of the compensation before these records; attached as `state.json` if they start a new file.
+        state : bytes or callable
+            State of the compensation before these records, or what encodes it; attached as `state.json` if they start
+            a new file.
         opening : mapping of str to bytes, optional
             More that is attached then, by name.
         sync : bool
@@ -113,7 +117,9 @@ class McapRecorder:
         try:
             if self._live is None or day != self._day:
                 self._finish("day")
-                self._open(time_utc_ns, day, {"state.json": state} | dict(opening or {}))
+                self._open(
+                    time_utc_ns, day, {"state.json": state() if callable(state) else state} | dict(opening or {})
+                )
             assert self._live is not None
             self._live.append(records, time_utc_ns)
             # The clock may be set back, too.
@@ -195,7 +201,9 @@ class McapRecorder:
             name, before = self._read_end()
         newest = max(filter(None, (previous[-1].stem if previous else "", name.removesuffix(".mcap"))), default="")
         paths = names(self._folder, self._machine, time_utc_ns, self._folder / f"{newest}.mcap" if newest else None)
-        live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns, self._topics)
+        live = self._live = RecordingFile(
+            paths, self._machine, before or chain.NOTHING, time_utc_ns, self._topics, self._axes
+        )
         self.path = live.path
         metadata = {
             "machine": self._machine,

@@ -13,6 +13,7 @@ import matplotlib.dates as mdates
 import numpy as np
 from dateutil.tz import tzlocal  # type: ignore[import-untyped]
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 
@@ -79,8 +80,7 @@ def svg(figure: Figure, prefix: str, width: float = WIDTH_IN) -> str:
             if panel.bars:
                 _bars(axes, panel.bars)
             _legend(axes, width)
-        if width == WIDTH_IN:
-            _align(canvas, rows[0])
+        _lay_out(canvas, rows[0], align=width == WIDTH_IN)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
@@ -96,13 +96,23 @@ def svg(figure: Figure, prefix: str, width: float = WIDTH_IN) -> str:
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
 
 
-def _align(canvas: Canvas, axes: Axes) -> None:
-    """Give the axes the left margin that all figures of a page have, so that figures below each other line up."""
-    canvas.draw_without_rendering()
-    engine, width = canvas.get_layout_engine(), canvas.get_figwidth()
-    missing = _LEFT_IN / width - axes.get_position().x0
-    if missing > 0.0 and engine is not None:
-        engine.set(rect=(missing, 0.0, 1.0 - missing, 1.0))  # type: ignore[call-arg]
+def _lay_out(canvas: Canvas, axes: Axes, *, align: bool) -> None:
+    """Place the axes once and for all: matplotlib would draw everything first, for each layout.
+
+    With `align` they get the left margin that all figures of a page have, so that figures below each other line up.
+    """
+    engine, width, dpi = canvas.get_layout_engine(), canvas.get_figwidth(), canvas.get_dpi()
+    assert engine is not None
+    if align:
+        engine.execute(canvas)
+        missing = _LEFT_IN / width - axes.get_position().x0
+        if missing > 0.0:
+            engine.set(rect=(missing, 0.0, 1.0 - missing, 1.0))  # type: ignore[call-arg]
+    # The letters are as wide as those of the file.
+    FigureCanvasSVG(canvas)
+    engine.execute(canvas)
+    canvas.set_layout_engine(None)
+    canvas.set_dpi(dpi)
 
 
 def _draw(axes: Axes, figure: Figure, colours: dict[str, int], panel: int) -> None:

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UnsetType
 
+from compensator.axes import FIRST
 from compensator.codes import RecordingEnd, State
 from compensator.errors import DataError
 from compensator.input_file import parse_toml
 from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample, number
+from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets
 from compensator.model.effects.base import label_of
 from compensator.recording.container import Container, Contents, Damaged, Torn
 from compensator.recording.reading import decode, in_order, records_of
@@ -77,6 +80,7 @@ class _Reader:
         self._add: dict[str, Callable[[Any], None]] = {
             "sample": self._sample,
             "estimate": self._estimate,
+            "offsets": self._axes,
             "offset": self._offset,
             "event": self._event,
             "probe": self._probe,
@@ -86,6 +90,8 @@ class _Reader:
         #: End of the last offset's sample; number and measured Y of the last estimate.
         self._last_s = math.nan
         self._measured = (-1, math.nan)
+        #: Values of further axes in the last estimate of a machine of several.
+        self._of_axes: tuple[int, dict[str, Any]] = (-1, {})
         self._episode: Episode | None = None
         self._numbers = count()
         self._effects: list[str] = []
@@ -136,7 +142,9 @@ class _Reader:
         except ValueError:
             table = {}
         self._model = str(table.get("name", ""))
-        self._effects = [label_of(effect) for effect in table.get("effect", [])]
+        # Of several axes: those of Y.
+        own = table.get("axis", {}).get(FIRST, table)
+        self._effects = [label_of(effect) for effect in own.get("effect", [])]
 
     def _sample(self, sample: Sample) -> None:
         t = sample.time_utc_ns * _NS
@@ -180,6 +188,8 @@ class _Reader:
             period.residual.add(residual, t)
             period.measured.add(y, t)
         self._measured = (estimate.seq, y)
+        if isinstance(estimate, AxesEstimate):
+            self._of_axes = (estimate.seq, estimate.axes)
 
     def _offset(self, offset: Offset) -> None:
         t, history = offset.time_utc_ns * _NS, self.history
@@ -202,6 +212,35 @@ class _Reader:
             period.offset.add(y_offset, t)
             period.left.add(y + y_offset, t)
             period.std.add(std, t)
+        self._slope(offset)
+
+    def _axes(self, offsets: RecordedOffsets) -> None:
+        """Add the offsets of further axes."""
+        for offset in offsets.messages():
+            self._axis(offset)
+
+    def _axis(self, offset: AxisOffset) -> None:
+        values = self._of_axes[1] if self._of_axes[0] == offset.seq else {}
+        name = f"{offset.axis}_{UNITS[offset.axis]}"
+        measured, residual = (number(values.get(key)) for key in (name, f"{offset.axis}_residual_um"))
+        self._add_output(offset.axis, offset, number(offset.y_offset_um), measured, residual)
+        self._slope(offset)
+
+    def _slope(self, offset: Offset) -> None:
+        if isinstance(offset, AxisOffset) and not isinstance(offset.y_slope_um_per_m, UnsetType):
+            self._add_output(f"{offset.axis}_slope", offset, number(offset.y_slope_um_per_m), math.nan, math.nan)
+
+    def _add_output(self, name: str, offset: Offset, value: float, measured: float, residual: float) -> None:
+        t = offset.time_utc_ns * _NS
+        figures = self.history.axes.setdefault(name, Period())
+        figures.samples += 1
+        figures.seconds[offset.state] += 1
+        self.history.axis_reasons[name].update(offset.reasons)
+        for spread, one in (("offset", value), ("measured", measured), ("residual", residual)):
+            getattr(figures, spread).add(one, t)
+        figures.left.add(measured + value, t)
+        for curve, one in (("offset", value), ("measured", measured), ("left", measured + value)):
+            self._append(f"axis {name} {curve}", t, one)
 
     def _probe(self, probe: Probe) -> None:
         history, deformation_um = self.history, number(probe.deformation_um)

@@ -219,6 +219,11 @@ class History:
         When each model was in force, by its SHA-256.
     story : Story
         What happened to the models.
+    axes : dict of str to Period
+        Figures of further axes, tilts and slopes by name, each in its unit; `seconds` counts samples. Their curves are
+        `axis NAME offset`, `axis NAME measured`, `axis NAME left`.
+    axis_reasons : dict of str to collections.Counter
+        Number of samples with each reason, by the same names.
     """
 
     machine: str = ""
@@ -241,6 +246,8 @@ class History:
     models: dict[str, tuple[str, float]] = field(default_factory=dict)
     in_force: dict[str, Stretches] = field(default_factory=dict)
     story: Story = field(default_factory=Story)
+    axes: dict[str, Period] = field(default_factory=dict)
+    axis_reasons: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
     @property
     def first_s(self) -> float:

@@ -13,12 +13,18 @@ def signed(value: float | None, digits: int = 2) -> str:
     >>> signed(1.234), signed(-0.5), signed(None), signed(math.nan)
     ('+1.23', '−0.50', '–', '–')
     """
-    return _formatted(value, f"+.{digits}f")
+    return _formatted(value, f"+z.{digits}f")
 
 
 def plain(value: float | None, digits: int = 2) -> str:
-    """Format a number; only a negative one has a sign."""
-    return _formatted(value, f".{digits}f")
+    """Format a number; only a negative one has a sign.
+
+    Examples
+    --------
+    >>> plain(-0.004), plain(-0.5)
+    ('0.00', '−0.50')
+    """
+    return _formatted(value, f"z.{digits}f")
 
 
 def _formatted(value: float | None, form: str) -> str:

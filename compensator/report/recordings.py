@@ -42,6 +42,8 @@ from compensator.report.page import (
     Words,
     warnings_of,
 )
+from compensator.report.several import axis_blocks, figures_of_axes
+from compensator.report.several import in_words as axes_in_words
 from compensator.report.story import figures_of, in_words, story_section
 
 #: Order of the states on the page.
@@ -87,6 +89,7 @@ def page_of(history: History) -> Page:
         *_story(history),
         _band(history),
         _figures(history),
+        *axis_blocks(history, _curves),
         _states(history),
     ]
     if history.reasons:
@@ -128,6 +131,7 @@ def figures(history: History) -> dict[str, object]:
         "models": list(history.models),
         **_probe_figures(history),
         **figures_of(history.story),
+        **figures_of_axes(history),
         "events": history.events_count,
         "alarms": history.episodes_count,
     }
@@ -155,6 +159,7 @@ def verdict(history: History) -> str:
         )
     elif whole.offset.samples:
         words += f"; it reached {signed(whole.offset.peak, 1)} µm"
+    words += axes_in_words(history)
     if history.probes_left.samples and not whole.left.samples:
         left = history.probes_left
         words += f"; {left.samples} probe(s) found {left.rms:.1f} µm rms with the offset applied"

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from compensator.axes import label_of
 from compensator.events import (
     CommandName,
     ComparisonData,
@@ -300,7 +301,7 @@ def story_tables(story: Story) -> list[Block]:
     if told:
         note = (
             "Error: measured − predicted of the present model → of the other one, over the measured Y or the probes "
-            "that were compared; σ: by how many standard deviations of the difference the other one is better."
+            "that were compared; σ: by how many standard deviations they refute the present one."
         )
         blocks.append(Table(head=head, rows=[_row(step) for step in told], note=note))
     lines: list[Cell] = [f"{shown(step.at_s)}: {step.text}" for step in story.steps]
@@ -313,8 +314,17 @@ def _row(step: Step) -> list[Cell]:
     found = step.comparison
     model = f"{step.model_sha256[:6]} {', '.join(step.effects)}".strip()
     figures = ["", ""]
-    if found is not None and found.present_rms_um is not None and found.candidate_rms_um is not None:
-        measured = f"{found.probes} probes" if found.measured_by == "probe" else f"{found.hours:.3g} h"
-        deviations = "" if found.deviations is None else f", {plain(found.deviations, 1)} σ"
-        figures = [f"{found.present_rms_um:.1f} → {found.candidate_rms_um:.1f}", f"{measured}{deviations}"]
+    if found is not None:
+        compared = {axis: _figures(one) for axis, one in found.by_axis().items()}
+        told = {f"{label_of(axis)} " if found.axes else "": one for axis, one in compared.items() if one is not None}
+        figures = ["; ".join(f"{axis}{one[i]}" for axis, one in told.items()) for i in (0, 1)]
     return [shown(step.at_s), WORDS.get(step.what, step.what), step.by, model, *figures]
+
+
+def _figures(found: ComparisonData) -> tuple[str, str] | None:
+    """Return both errors, and on what they rest; None if nothing was compared."""
+    if found.present_rms_um is None or found.candidate_rms_um is None:
+        return None
+    measured = f"{found.probes} probes" if found.measured_by == "probe" else f"{found.hours:.3g} h"
+    deviations = "" if found.deviations is None else f", {plain(found.deviations, 1)} σ"
+    return f"{found.present_rms_um:.1f} → {found.candidate_rms_um:.1f}", f"{measured}{deviations}"

@@ -7,20 +7,25 @@ same estimate and the same offset again, bit for bit. The published offset never
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.axes import FIRST
 from compensator.clock import NS
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
-from compensator.errors import DataError, ServiceError
+from compensator.errors import DataError, ModelError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Probe, Sample, number
+from compensator.messages_axes import AxisOffset
 from compensator.model.engine import Engine, Estimate
-from compensator.model.model_file import parse_model
+from compensator.model.model_file import parse_axes, parse_model
+from compensator.model.outputs import with_outputs
 from compensator.model.thermal_model import ThermalModel
+from compensator.service.axes import FurtherOutputs, planned_outputs
+from compensator.service.axes_decision import FurtherDecision
 from compensator.service.decision import Decision, OffsetDecision, mean
 from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
@@ -40,7 +45,7 @@ from compensator.service.state import (
     ZeroMode,
     ZeroState,
     decode_state,
-    encode_state,
+    frozen_state,
 )
 from compensator.service.status import CompensationStatus, Handover, Zero
 
@@ -71,16 +76,24 @@ class Compensation:
                 f"model {model.name}: an effect needs channel {names_missing}, which is not configured; `compensator "
                 "check` prints the lines to paste"
             )
+        wanted = [one.output for one in planned_outputs(config.axis)]
+        if list(model.outputs) != wanted:
+            names_of = ", ".join(one.name for one in wanted) or "Y alone"
+            raise ServiceError(f"model {model.name}: its axes are not those of the configuration, expected {names_of}")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self.plausibility = PlausibilityCheck(config, model)
         self._jumps = JumpWatch(config, model)
-        self._decision = OffsetDecision(config, model, self._engine.channels)
+        own_channels = dict.fromkeys(channel for effect in model.effects for channel in effect.measured)
+        self._decision = OffsetDecision(config, model, tuple(own_channels))
         self._limiter = self._decision.limiter
+        self.outputs = FurtherOutputs(config.axis)
+        self._further = FurtherDecision(self.outputs, model, self._decision) if config.axis is not None else None
         self._probes: tuple[ReceivedProbe, ...] = ()
         self.probing = Probing.of(config, self._engine.contribution_names, model.period_s)
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
-        self._slowest_min = slowest_min(model)
+        #: Slowest time constant of the model, min.
+        self.slowest_min = slowest_min(model)
 
     # ------------------------------------------------------------------ commands
 
@@ -131,11 +144,16 @@ class Compensation:
         self._memory.internal_error = True
 
     def held(self, machine: str, seq: int, time_utc_ns: int) -> Offset:
-        """Return the message for a sample that could not be processed: the last offset is held."""
+        """Return the message of Y for a sample that could not be processed: the last offset is held."""
+        return self.held_axes(machine, seq, time_utc_ns)[0]
+
+    def held_axes(self, machine: str, seq: int, time_utc_ns: int) -> tuple[Offset, ...]:
+        """Return the messages of all axes for a sample that could not be processed, that of Y first."""
         known = self._memory.estimate is not None
         limited = self._limiter.hold() if known else None
         decision = Decision(State.HOLD if known else State.FAULT, [Reason.INTERNAL_ERROR], limited)
-        return decision.message(self.model, machine, seq, time_utc_ns, NAN)
+        offset = decision.message(self.model, machine, seq, time_utc_ns, NAN)
+        return (offset,) if self._further is None else self._further.hold(offset, known=known)
 
     # ------------------------------------------------------------------ state
 
@@ -146,7 +164,11 @@ class Compensation:
         return CompensationStatus(
             seq=memory.seq,
             time_utc_ns=memory.time_utc_ns,
-            zero=Zero.of_references(self._engine.reference, zero) if self._engine.has_reference else None,
+            zero=(
+                Zero.of_references(self._engine.reference, zero, self.outputs.states)
+                if self._engine.has_reference
+                else None
+            ),
             is_known=memory.cold_min <= 0.0,
             target_um=0.0 - prediction.y_um,
             std_um=prediction.std_um,
@@ -157,8 +179,15 @@ class Compensation:
                 waiting_zero=zero.mode if zero.wanted else None,
                 model_changed=memory.model_changed,
                 probing=probing.handover if probing is not None else None,
+                further=self.outputs.offsets(),
             ),
         )
+
+    @property
+    def further_targets(self) -> dict[str, float]:
+        """Offsets of the further outputs by the model, before limits, by name; NaN without an estimate."""
+        found = self.outputs.predictions(self._memory.estimate)
+        return {one.name: 0.0 - predicted.value for one, predicted in zip(self.outputs.planned, found, strict=True)}
 
     @property
     def wanted(self) -> Wanted | None:
@@ -178,7 +207,7 @@ class Compensation:
     def bridge_max_min(self) -> float:
         """Longest pause that is interpolated, min."""
         wanted = self._config.restart.bridge_max_min
-        return min(self._slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
+        return min(self.slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
 
     def describe_checks(self) -> str:
         """Describe which checks of the sensors are on and off."""
@@ -186,7 +215,11 @@ class Compensation:
 
     def state(self) -> bytes:
         """Return everything that determines the next outcome, as JSON without loss of precision."""
-        return encode_state(
+        return self.frozen()()
+
+    def frozen(self) -> Callable[[], bytes]:
+        """Return what encodes the present state, see `state`, whatever is processed until it is called."""
+        return frozen_state(
             CompensationState(
                 schema=STATE_SCHEMA,
                 model_sha256=self.model.sha256,
@@ -199,6 +232,7 @@ class Compensation:
                 plausibility=self.plausibility.state if self.plausibility.is_on else None,
                 probing=self.probing.state if self.probing is not None else None,
                 jumps=self._jumps.state if self._jumps.is_on else None,
+                axes=self.outputs.states if self._further is not None else None,
             )
         )
 
@@ -215,6 +249,7 @@ class Compensation:
             ("model_sha256", restored.model_sha256, self.model.sha256),
             ("alternative", restored.alternative, self._config.model.alternative),
             ("guards", sorted(restored.guards), sorted(self._guards.snapshot())),
+            ("axes", sorted(restored.axes or {}), sorted(self.outputs.states)),
         ):
             if found != expected:
                 raise DataError(f"state: {name} = {found!r}, expected {expected!r}")
@@ -228,11 +263,14 @@ class Compensation:
         estimate = restored.memory.estimate
         if estimate is not None and len(estimate.y_effects_um) != len(self.model.effects):
             raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
+        if estimate is not None and len(estimate.outputs) != len(self.model.outputs):
+            raise DataError(f"state: estimate of {len(estimate.outputs)} further outputs")
         if self.probing is not None and restored.probing is not None:
             self.probing.restore(restored.probing)
         self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
         self._guards.restore(restored.guards)
         self._limiter.offset_um = restored.offset_um
+        self.outputs.states = {name: (restored.axes or {})[name] for name in self.outputs.states}
         # A state from a version without these checks does not contain theirs.
         self.plausibility.state = restored.plausibility or PlausibilityState()
 
@@ -250,7 +288,7 @@ class Compensation:
             Number of samples; 0 has no effect. None if it is unknown, which counts as too long to be bridged.
         """
         if samples is None:
-            longest = max(KNOWN_AFTER * self._slowest_min, self.bridge_max_min)
+            longest = max(KNOWN_AFTER * self.slowest_min, self.bridge_max_min)
             samples = math.floor(longest / self._period_min) + 1
         if samples <= 0:
             return
@@ -272,11 +310,11 @@ class Compensation:
     @property
     def _cold_samples(self) -> int:
         """Samples after which a state that started unknown counts as known."""
-        return min(math.ceil(KNOWN_AFTER * self._slowest_min / self._period_min), MOST_BRIDGED)
+        return min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED)
 
     def _pass_cold(self, samples: int) -> None:
         self._memory.estimate = self._engine.skip(samples, held=True)
-        self._memory.cold_min = KNOWN_AFTER * self._slowest_min
+        self._memory.cold_min = KNOWN_AFTER * self.slowest_min
 
     def begin(self, zero: Zero | None) -> None:
         """Start with a zero that was set before the record, and with an unknown state.
@@ -286,6 +324,7 @@ class Compensation:
         zero : Zero or None
             None to wait for the zero of the record, regardless of `zero.at_start`.
         """
+        self.outputs.begin({} if zero is None else zero.further)
         if zero is None:
             self._zero = ZeroState()
             return
@@ -299,6 +338,7 @@ class Compensation:
         memory, zero = self._memory, self._zero
         memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
         memory.model_changed = handover.model_changed
+        self.outputs.continue_from(handover.further, model_changed=handover.model_changed)
         zero.wanted, zero.mode = handover.waiting_zero is not None, handover.waiting_zero or zero.mode
         if self.probing is not None and handover.probing is not None:
             self.probing.continue_from(handover.probing)
@@ -338,6 +378,7 @@ class Compensation:
             self._memory.estimate = estimate
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
+            self.outputs.remember(estimate, MEAN_SAMPLES)
             self._remember_sample(raw.time_utc_ns, estimate)
         decided = self._decide_probes(raw, notes)
         prediction = self._prediction() if estimate else Prediction()
@@ -347,20 +388,30 @@ class Compensation:
             self._zero.y_ref = values.y - y_pred
         if self.plausibility.is_on:
             notes += self.plausibility.update(self._evidence(raw, values, prediction))
-        decision = self._decision.decide(
-            values, prediction if estimate else None, self._memory, self.plausibility, self._jumps
-        )
+        condition = self._decision.condition(values, estimate is not None, self._memory, self.plausibility, self._jumps)
+        decision = self._decision.decide(condition, values, prediction if estimate else None, self._memory)
         if self.probing is not None and decision.limited is not None:
             held = decision.state in (State.HOLD, State.FAULT)
             self.probing.publish(decision.limited.offset_um, decision.limited.rate_um_per_min, is_held=held)
         # During an alarm the offset may be wrong by the difference between measured and predicted Y.
         std = math.hypot(prediction.std_um, self.plausibility.error_um, self._jumps.doubt_um)
+        offset = decision.message(self.model, sample.machine, sample.seq, sample.time_utc_ns, std)
+        axes: dict[str, float | list[float] | None] | None = None
+        further: tuple[AxisOffset, ...] = ()
+        if self._further is not None:
+            predictions = self.outputs.predictions(estimate)
+            axes = self.outputs.values(estimate, predictions, values.others)
+            offset, *others = self._further.decide(
+                offset, condition, values, predictions if estimate else None, self._jumps.doubts
+            )
+            further = tuple(others)
         return Outcome(
             sample=sample,
-            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, prediction),
-            offset=decision.message(self.model, sample.machine, sample.seq, sample.time_utc_ns, std),
+            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, prediction, axes),
+            offset=offset,
             notes=tuple(notes),
             probes=decided,
+            further=further,
         )
 
     def _judge_jumps(self, sample: Sample, values: Values, notes: list[Note]) -> Estimate | None:
@@ -449,6 +500,7 @@ class Compensation:
             self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
+        self.outputs.set_zero(self._memory.estimate if warm else None, values.others)
         self.plausibility.reset(at_rest=not warm)
         self._jumps.reset(at_rest=not warm)
         if self.probing is not None:
@@ -467,7 +519,8 @@ class Compensation:
             return mode == "warm"
         # A machine at a long thermal plateau grows slowly but is heated: this must not become a zero at rest.
         heated = abs(mean(self._memory.heats)) > HEATED_W
-        return heated or abs(mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
+        largest = max(abs(mean(self._memory.rates)), self.outputs.largest_rate_um_per_min())
+        return heated or largest > self._config.zero.rest_rate_um_per_min
 
 
 def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:
@@ -478,14 +531,30 @@ def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:
     ModelError
         If the model cannot be used; the message names the source and the error.
     """
-    model = parse_model(data, source=source)
-    return model.with_alternative(config.model.alternative) if config.model.alternative else model
+    name = config.model.alternative
+    if config.axis is None:
+        model = parse_model(data, source=source)
+        return model.with_alternative(name) if name else model
+    models = parse_axes(data, source=source)
+    if name and not any(name in one.alternatives for one in models.values()):
+        raise ModelError(f"{source}: no alternative {name!r}")
+    if name:
+        models = {axis: one.with_alternative(name) if name in one.alternatives else one for axis, one in models.items()}
+    first = config.axis.y.part_of(FIRST)
+    if first not in models:
+        raise ModelError(f"{source}: axis y: no part axis.{first} in the model, it has: {', '.join(models)}")
+    try:
+        return with_outputs(models, first, [one.output for one in planned_outputs(config.axis)])
+    except ModelError as error:
+        raise ModelError(f"{source}: {error}") from error
 
 
 def slowest_min(model: ThermalModel) -> float:
-    """Return the slowest time constant of a model's paths and effects, min."""
-    paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
-    times = [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
-    for effect in model.effects:
-        times += effect.time_constants_min
+    """Return the slowest time constant of the paths and effects of a model and its further parts, min."""
+    times: list[float] = []
+    for part in (model, *model.parts):
+        paths = [path for path in (part.ttf, part.dtf, part.tdtf) if path is not None]
+        times += [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
+        for effect in part.effects:
+            times += effect.time_constants_min
     return max(times, default=model.period_s / 60.0)

@@ -14,6 +14,7 @@ from compensator.recording.finishing import Retention
 from compensator.recording.live_file import topics_of
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
+from compensator.service.axes import planned_outputs
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.loading import Setup
@@ -90,6 +91,7 @@ async def run_service(
     loaded, config, folder = setup.loaded, setup.config, setup.recordings
     machine, clock = config.machine.name, clock or SystemClock()
     with sole_user(folder, machine):
+        axes = config.axis.names() if config.axis is not None else ()
         recorder = McapRecorder(
             folder,
             machine,
@@ -97,7 +99,10 @@ async def run_service(
             retention=Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb),
             signer=setup.signer,
             head=setup.head,
-            topics=topics_of(probes=config.probe is not None, loop=config.loop is not None and config.loop.is_on),
+            topics=topics_of(
+                probes=config.probe is not None, loop=config.loop is not None and config.loop.is_on, axes=axes
+            ),
+            axes=axes,
         )
 
         def command(name: str, payload: bytes, sender: Sender) -> Reply:
@@ -110,14 +115,15 @@ async def run_service(
             if on_publish is not None:
                 on_publish(name, data)
 
-        publisher = Publisher(config.zenoh, command)
+        publisher = Publisher(config.zenoh, command, axes)
         try:
             for warning in setup.warnings():
                 log.warning("%s: warning: %s", loaded.path, warning.marked)
         except ConfigError as error:  # recording continues even if the offset cannot be received
             log.error("%s; the router will refuse the service", error)
         checkpoint = OffsetCheckpoint(folder, machine)
-        checkpointed = checkpoint.read(config.limits.offset_max_um)
+        further_max = {one.name: one.bounds.offset_max_um for one in planned_outputs(config.axis)}
+        checkpointed = checkpoint.read(config.limits.offset_max_um, further_max)
         resumed = resume(loaded, setup.model, checkpointed)
         loop = loop_parts(setup, resumed, diagnose)
         first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)

@@ -11,14 +11,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from msgspec.structs import replace as replace_fields
 
 from compensator import __version__
+from compensator.axes import FIRST, label_of
 from compensator.clock import NS, Clock
 from compensator.config import Config
 from compensator.events import EventKind, Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
+from compensator.messages_axes import AxesStatus, AxisOffset, AxisState
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.disk_writer import DiskWriter, Entry, Recorder
@@ -235,12 +238,18 @@ class Daemon:
         await self._await_pending()
         self._sampler.close_sample()  # its readings belong to no later sample
         machine, sequence = self._config.machine.name, self._events.sequence
-        held = self._compensation.held(machine, sequence, label_ns)
+        held, *further = self._compensation.held_axes(machine, sequence, label_ns)
         probes, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []
-        offset = await self._journal.record(
-            label_ns, self._compensation.state(), opening=self._opening(), probes=probes, offset=held
+        offsets = await self._journal.record(
+            label_ns,
+            self._compensation.state(),
+            opening=self._opening(),
+            probes=probes,
+            offset=held,
+            further=[one for one in further if isinstance(one, AxisOffset)],
         )
-        self._publish("offset", encode(offset or held))
+        for topic, offset in offsets.items():
+            self._publish(topic, encode(offset))
         self._events.sequence += 1
 
     @property
@@ -283,7 +292,7 @@ class Daemon:
         self._compensation = self._adoption.swap()
         if self._loop is not None:
             self._compensation = self._loop.before_sample(self._compensation)
-        state, opening, failed_midway = self._compensation.state(), self._opening(), self._failed_midway
+        state, opening, failed_midway = self._compensation.frozen(), self._opening(), self._failed_midway
         self._failed_midway = True
         self._commands.apply(self._compensation)
         if self._loop is not None:
@@ -304,8 +313,9 @@ class Daemon:
             self._journal.start_new_file()
         for note in outcome.notes:
             self._events.note(*note)
-        candidate = self._loop.process(outcome) if self._loop is not None else None
-        self._note_state(self._journal.expected(outcome.offset))
+        candidates = self._loop.process(outcome) if self._loop is not None else ()
+        expected = self._journal.expected
+        self._note_state(expected(outcome.offset), [expected(one) for one in outcome.further])
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
         probes = [*(replace_fields(probe, seq=raw.seq) for probe in unread), *outcome.probes]
         entry = self._journal.enqueue(
@@ -313,10 +323,11 @@ class Daemon:
             state,
             sample=sample,
             estimate=estimate,
-            candidate=encode(candidate) if candidate is not None else b"",
+            candidates=[encode(candidate) for candidate in candidates],
             opening=opening,
             probes=probes,
             offset=outcome.offset,
+            further=outcome.further,
         )
         decided = _Decided(outcome=outcome, entry=entry, began=began)
         if await self._journal.wait_briefly(entry):
@@ -339,9 +350,12 @@ class Daemon:
         entry = decided.entry
         offset = self._journal.resolve(entry)
         assert offset is not None
-        self._note_state(offset)
-        outcome = replace(decided.outcome, offset=offset)
-        self._publish("offset", encode(offset))
+        published = entry.offsets()
+        further = tuple(one for one in published.values() if isinstance(one, AxisOffset) and one.axis != FIRST)
+        outcome = replace(decided.outcome, offset=offset, further=further)
+        self._note_state(offset, further)
+        for topic, message in published.items():
+            self._publish(topic, encode(message))
         self.latency.add(time.perf_counter() - decided.began)
         self._publish("sample", entry.sample)
         self._publish("estimate", entry.estimate)
@@ -409,6 +423,11 @@ class Daemon:
             devices=self._sampler.device_states(),
             effects=[effect.label for effect in model.effects],
         )
+        if outcome.further:
+            axes = {one.axis: AxisState(state=one.state, reasons=one.reasons) for one in outcome.further}
+            axes[FIRST] = AxisState(state=outcome.offset.state, reasons=outcome.offset.reasons)
+            own = {name: getattr(status, name) for name in status.__struct_fields__}
+            status = AxesStatus(**own, axes={name: axes[name] for name in self._compensation.outputs.names})
         loop = self._loop.status() if self._loop is not None else None
         if loop is not None:
             status = replace_fields(status, loop=loop)
@@ -429,10 +448,16 @@ class Daemon:
 
     # ------------------------------------------------------------------ events and commands
 
-    def _note_state(self, offset: Offset) -> None:
-        now = " ".join([offset.state, *offset.reasons])
+    def _note_state(self, offset: Offset, further: Sequence[AxisOffset] = ()) -> None:
+        """Note a change of the state; other axes are named where theirs is not that of Y."""
+        own = " ".join([offset.state, *offset.reasons])
+        others = {one.axis: " ".join([one.state, *one.reasons]) for one in further}
+        now = "; ".join([own, *(f"{label_of(axis)} {text}" for axis, text in others.items() if text != own)])
         if now != self._last_state:
-            self._events.note(EventKind.STATE, now, {"state": offset.state, "reasons": offset.reasons})
+            data: dict[str, Any] = {"state": offset.state, "reasons": offset.reasons}
+            if further:
+                data["axes"] = {one.axis: {"state": one.state, "reasons": one.reasons} for one in further}
+            self._events.note(EventKind.STATE, now, data)
             self._last_state = now
 
     def _note_clock_step(self, seconds: float) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from compensator.arrays import NAN
 from compensator.codes import Reason, State
-from compensator.config import Config, Limits
+from compensator.config import Config
 from compensator.messages import SCHEMA, Offset
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.outcome import Prediction, Values
@@ -53,10 +54,51 @@ class Decision:
         )
 
 
+class OffsetLimits(Protocol):
+    """Limits of an offset, in its unit; the names are for µm."""
+
+    @property
+    def offset_max_um(self) -> float:
+        """Largest magnitude."""
+
+    @property
+    def offset_rate_max_um_per_min(self) -> float:
+        """Largest rate."""
+
+
+class Following(Protocol):
+    """What is kept for an output."""
+
+    #: Whether the offset is still moving to that of another model.
+    model_changed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What a sample means for every axis: reasons that are the machine's, and whether the offsets are held.
+
+    Parameters
+    ----------
+    channels, later : list of str
+        Reasons of the temperatures, and those that come after the axis' own channels.
+    blocking : list of str
+        Why every offset is held.
+    lost, expired, exchanged : bool
+        Whether a temperature is missing, for too long, or both seem to be exchanged.
+    """
+
+    channels: list[str]
+    later: list[str]
+    blocking: list[str]
+    lost: bool
+    expired: bool
+    exchanged: bool
+
+
 class OffsetLimiter:
     """Keeps the offset within its limits, so that it never jumps; `period_min` is the length of a sample, min."""
 
-    def __init__(self, limits: Limits, period_min: float) -> None:
+    def __init__(self, limits: OffsetLimits, period_min: float) -> None:
         self._max_um = limits.offset_max_um
         self._rate_max = limits.offset_rate_max_um_per_min
         self._period_min = period_min
@@ -103,7 +145,7 @@ class OffsetLimiter:
 
 
 class OffsetDecision:
-    """Decides state, reasons and offset of each sample; `channels` are those that the model's effects use."""
+    """Decides state, reasons and offset of each sample; `channels` are those that the effects of Y use."""
 
     def __init__(self, config: Config, model: ThermalModel, channels: Sequence[str]) -> None:
         self._channels = tuple(channels)
@@ -112,22 +154,26 @@ class OffsetDecision:
         self._validity = _validity(config, model)
         self.limiter = OffsetLimiter(config.limits, self._period_min)
 
-    def decide(
+    def decide(self, condition: Condition, values: Values, prediction: Prediction | None, memory: Memory) -> Decision:
+        """Decide Y, see `decided`."""
+        return self.decided(condition, values, self._channels, prediction, self.limiter, memory)
+
+    def condition(
         self,
         values: Values,
-        prediction: Prediction | None,
+        has_zero: bool,
         memory: Memory,
         plausibility: PlausibilityCheck,
         jumps: JumpWatch | None = None,
-    ) -> Decision:
-        """Decide one sample.
+    ) -> Condition:
+        """Return what a sample means for every axis; called once for each sample.
 
         Parameters
         ----------
         values : Values
             Its usable values.
-        prediction : Prediction, optional
-            Predicted deformation since the zero, None before the first zero.
+        has_zero : bool
+            Whether there is a prediction.
         memory : Memory
             Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
@@ -143,24 +189,57 @@ class OffsetDecision:
             reasons += [f"{Reason.UNCONFIRMED_CHANNEL}:{name}" for name in jumps.unconfirmed]
         memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
         expired = lost and memory.missing_min > self._predict_for_min
+        later: list[str] = []
+        blocking: list[str] = []
+        if has_zero:
+            if memory.cold_min > 0.0:
+                memory.cold_min -= self._period_min
+                later.append(Reason.COLD_START)
+            later += plausibility.reasons
+            blocking = self._blocking(values, expired, memory, plausibility)
+        return Condition(reasons, later, blocking, lost, expired, plausibility.exchanged)
+
+    def decided(
+        self,
+        condition: Condition,
+        values: Values,
+        channels: Sequence[str],
+        prediction: Prediction | None,
+        limiter: OffsetLimiter,
+        memory: Following,
+    ) -> Decision:
+        """Decide one axis.
+
+        Parameters
+        ----------
+        condition : Condition
+            What the sample means for every axis.
+        values : Values
+            Its usable values.
+        channels : sequence of str
+            Channels that the effects of the axis use.
+        prediction : Prediction, optional
+            Predicted deformation of the axis since the zero, in its unit; None before the first zero.
+        limiter : OffsetLimiter
+            That of the axis.
+        memory : Following
+            That of the axis.
+        """
         if prediction is None:
-            return Decision(State.FAULT if expired else State.STARTING, [*reasons, Reason.NO_ZERO], None)
-        missing = (name for name in self._channels if math.isnan(values.others.get(name, NAN)))
-        reasons += [f"{Reason.CHANNEL_MISSING}:{name}" for name in missing]
-        if memory.cold_min > 0.0:
-            memory.cold_min -= self._period_min
-            reasons.append(Reason.COLD_START)
-        reasons += plausibility.reasons
-        blocking = self._blocking(values, expired, memory, plausibility)
-        if plausibility.exchanged:
-            return Decision(State.FAULT, [*reasons, *blocking, Reason.T_Q_AT_EXCHANGED], self.limiter.hold())
+            state = State.FAULT if condition.expired else State.STARTING
+            return Decision(state, [*condition.channels, Reason.NO_ZERO], None)
+        missing = (name for name in channels if math.isnan(values.others.get(name, NAN)))
+        reasons = [*condition.channels, *(f"{Reason.CHANNEL_MISSING}:{name}" for name in missing), *condition.later]
+        blocking = condition.blocking
+        if condition.exchanged:
+            return Decision(State.FAULT, [*reasons, *blocking, Reason.T_Q_AT_EXCHANGED], limiter.hold())
         if blocking:
-            return Decision(State.HOLD, reasons + blocking, self.limiter.hold())
-        if lost:
+            return Decision(State.HOLD, reasons + blocking, limiter.hold())
+        if condition.lost:
             reasons.append(Reason.PREDICTING)
         if prediction.is_limited:
             reasons.append(Reason.CORRECTION_LIMITED)
-        limited = self.limiter.follow(0.0 - prediction.y_um, -prediction.rate_um_per_min)
+        limited = limiter.follow(0.0 - prediction.y_um, -prediction.rate_um_per_min)
         memory.model_changed &= Reason.RATE_LIMITED in limited.reasons
         if memory.model_changed:
             reasons.append(Reason.MODEL_CHANGED)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +17,17 @@ from typing import Any, Protocol
 
 from compensator.codes import Reason
 from compensator.messages import Event, Offset, degraded, encode
+from compensator.messages_axes import AxisOffset, recorded_offsets, topic_of
 from compensator.recording.naming import day_of
 from compensator.service.event_log import WAITING_EVENTS
 
 #: Largest number of queued samples (four hours at one per minute), which bounds the memory if the disk fails; beyond
 #: that the oldest are dropped.
 WAITING_SAMPLES = 240
+
+
+#: A state, or what encodes it where it is needed.
+Saved = bytes | Callable[[], bytes]
 
 
 class Recorder(Protocol):
@@ -37,7 +42,7 @@ class Recorder(Protocol):
         records: Iterable[tuple[str, bytes]],
         time_utc_ns: int,
         *,
-        state: bytes = b"",
+        state: Saved = b"",
         opening: Mapping[str, bytes] | None = None,
         sync: bool = True,
     ) -> None:
@@ -61,18 +66,22 @@ class Entry:
     ----------
     time_utc_ns : int
         Its time, ns since 1970 UTC.
-    state : bytes
-        State of the compensation before it.
+    state : bytes or callable
+        State of the compensation before it, or what encodes it.
     events : list of Event
         Events since the previous sample.
-    sample, estimate, candidate : bytes
+    sample, estimate : bytes
         JSON; empty if there is none.
+    candidates : sequence of bytes
+        JSON of the models in shadow.
     opening : mapping of str to bytes
         What is attached beside the state if it opens a file.
     probes : list of bytes
         JSON of the probes that were decided with the sample.
     offset : Offset, optional
-        The offset as decided.
+        The offset as decided, that of Y.
+    further : sequence of AxisOffset
+        Those of further axes, which belong to it.
     new_file : bool
         Whether it must open a new file.
     model : bytes, optional
@@ -80,14 +89,15 @@ class Entry:
     """
 
     time_utc_ns: int
-    state: bytes
+    state: Saved
     events: list[Event] = field(default_factory=list)
     sample: bytes = b""
     estimate: bytes = b""
-    candidate: bytes = b""
+    candidates: Sequence[bytes] = ()
     opening: Mapping[str, bytes] = field(default_factory=dict)
     probes: list[bytes] = field(default_factory=list)
     offset: Offset | None = None
+    further: Sequence[AxisOffset] = ()
     new_file: bool = False
     model: bytes | None = None
     #: Reason with which the offset was published before it was on disk, empty otherwise.
@@ -100,11 +110,23 @@ class Entry:
         """Return topic and JSON of all records; the offset as published, if it was published already."""
         records = [("event", encode(event)) for event in self.events]
         records += [("probe", data) for data in self.probes]
-        parts = (("sample", self.sample), ("estimate", self.estimate), ("candidate", self.candidate))
+        parts = [("sample", self.sample), ("estimate", self.estimate)]
+        parts += [("candidate", data) for data in self.candidates]
         records += [(topic, data) for topic, data in parts if data]
-        if self.offset is not None:
-            records.append(("offset", encode(degraded(self.offset, self.reason) if self.reason else self.offset)))
+        published = self.offsets()
+        if self.further:
+            further = recorded_offsets(one for one in published.values() if isinstance(one, AxisOffset))
+            records.append(("offsets", encode(further)))
+        if "offset" in published:
+            records.append(("offset", encode(published["offset"])))
         return records
+
+    def offsets(self) -> dict[str, Offset]:
+        """Return the offset of each axis as published, by the name under which it is; that of Y is the last."""
+        found: dict[str, Offset] = {topic_of(one.axis): one for one in self.further}
+        if self.offset is not None:
+            found["offset"] = self.offset
+        return {name: degraded(offset, self.reason) if self.reason else offset for name, offset in found.items()}
 
     @property
     def day(self) -> str:

@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from compensator.clock import Clock
 from compensator.codes import Reason, Remark, ServiceWarning
 from compensator.events import EventKind, RecordingCode, RecordingData
-from compensator.messages import Offset, Probe, degraded, encode
-from compensator.service.disk_writer import DiskWriter, Entry
+from compensator.messages import AnyOffset, Offset, Probe, degraded, encode
+from compensator.messages_axes import AxisOffset, further_values
+from compensator.service.disk_writer import DiskWriter, Entry, Saved
 from compensator.service.event_log import EventLog
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 
@@ -76,19 +77,20 @@ class Journal:
     def enqueue(
         self,
         time_utc_ns: int,
-        state: bytes,
+        state: Saved,
         *,
         sample: bytes = b"",
         estimate: bytes = b"",
-        candidate: bytes = b"",
+        candidates: Sequence[bytes] = (),
         opening: Mapping[str, bytes] | None = None,
         probes: Sequence[Probe] = (),
         offset: Offset | None = None,
+        further: Sequence[AxisOffset] = (),
     ) -> Entry:
         """Queue a sample with the events since the previous one.
 
-        `state` is that of the compensation before the sample, `opening` what else a file that starts with it begins
-        with; `sample`, `estimate` and `candidate` are JSON, empty if there is none.
+        `state` is that of the compensation before the sample, or what encodes it, `opening` what else a file that
+        starts with it begins with; `sample`, `estimate` and `candidates` are JSON, empty if there is none.
         """
         entry = Entry(
             time_utc_ns=time_utc_ns,
@@ -96,10 +98,11 @@ class Journal:
             events=self._events.drain(),
             sample=sample,
             estimate=estimate,
-            candidate=candidate,
+            candidates=candidates,
             opening=opening or {},
             probes=[encode(probe) for probe in probes],
             offset=offset,
+            further=further,
             new_file=self._new_file,
             model=self._model,
         )
@@ -129,7 +132,8 @@ class Journal:
         if self._checkpoint is not None and not entry.reason:
             self._checkpoint.remove()
         elif self._checkpoint is not None and entry.offset is not None:
-            self._checkpoint.write(entry.offset)
+            named = [one for one in (*entry.further, entry.offset) if isinstance(one, AxisOffset)]
+            self._checkpoint.write(entry.offset, further_values(named))
         return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
 
     async def record(
@@ -140,13 +144,21 @@ class Journal:
         opening: Mapping[str, bytes] | None = None,
         probes: Sequence[Probe] = (),
         offset: Offset | None = None,
-    ) -> Offset | None:
-        """Write the queued events, probes and an offset without a sample to disk; return the offset to be published."""
-        entry = self.enqueue(time_utc_ns, state, opening=opening, probes=probes, offset=offset)
-        await self.wait_briefly(entry)
-        return self.resolve(entry)
+        further: Sequence[AxisOffset] = (),
+    ) -> dict[str, Offset]:
+        """Write the queued events, probes and offsets without a sample to disk.
 
-    def expected(self, offset: Offset) -> Offset:
+        Returns
+        -------
+        dict of str to Offset
+            Offset of each axis to be published, by name.
+        """
+        entry = self.enqueue(time_utc_ns, state, opening=opening, probes=probes, offset=offset, further=further)
+        await self.wait_briefly(entry)
+        self.resolve(entry)
+        return entry.offsets()
+
+    def expected(self, offset: AnyOffset) -> AnyOffset:
         """Return the offset as it will be published if the disk behaves as with the previous sample."""
         return degraded(offset, self._reason) if self._reason else offset
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import drivers
+from compensator.axes import column_of
 from compensator.certificates import Certificate, check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
@@ -170,6 +171,8 @@ def _fleet(path: str, config: Config) -> drivers.Fleet:
     except DriverConfigError as error:
         raise ConfigError(str(error)) from error
     expected_units = {"t_q_degc": "degc", "at_degc": "degc", "y_um": "um"}
+    if config.axis is not None:
+        expected_units |= {column_of(axis): "um" for axis in config.axis.linear()}
     for channel in config.channel:
         units = fleet.devices[channel.device].units
         if channel.input not in units:

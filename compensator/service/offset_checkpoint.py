@@ -12,6 +12,7 @@ import logging
 import math
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -27,12 +28,16 @@ MEMORY = Path("/dev/shm")
 _LONGEST = 4096
 
 
-class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An offset that was published before it was on disk; the fields are those of `Offset`."""
+class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """An offset that was published before it was on disk; the fields are those of `Offset`.
+
+    `further` are the values of further outputs by name, each in its unit.
+    """
 
     seq: int
     time_utc_ns: int
     y_offset_um: float
+    further: dict[str, float] = {}
 
 
 class OffsetCheckpoint:
@@ -53,12 +58,23 @@ class OffsetCheckpoint:
         self.path = memory / f"compensator-{name}.json"
         self._written = True
 
-    def write(self, offset: Offset) -> None:
-        """Keep an offset that is being published; if that fails the service continues without the checkpoint."""
+    def write(self, offset: Offset, further: Mapping[str, float] | None = None) -> None:
+        """Keep an offset that is being published; if that fails the service continues without the checkpoint.
+
+        Parameters
+        ----------
+        offset : Offset
+            The offset of Y.
+        further : mapping of str to float, optional
+            Values of further outputs by name.
+        """
         value = number(offset.y_offset_um)
         if math.isnan(value):
             return
-        checkpointed = CheckpointedOffset(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
+        known = {name: one for name, one in (further or {}).items() if not math.isnan(one)}
+        checkpointed = CheckpointedOffset(
+            seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value, further=known
+        )
         try:
             replace_file(self.path, msgspec.json.encode(checkpointed), mode=0o600, sync=False)
         except OSError as error:
@@ -77,13 +93,15 @@ class OffsetCheckpoint:
             figures = f"{self.path}: cannot be removed: {error}."
             log.warning("%s", Remark(ServiceWarning.CHECKPOINT_NOT_REMOVED, figures).marked)
 
-    def read(self, offset_max_um: float) -> CheckpointedOffset | None:
+    def read(self, offset_max_um: float, further_max: Mapping[str, float] | None = None) -> CheckpointedOffset | None:
         """Return the offset; None if there is none, another user wrote it, or it is not a possible offset.
 
         Parameters
         ----------
         offset_max_um : float
             Largest offset, µm.
+        further_max : mapping of str to float, optional
+            Largest value of each further output by name.
         """
         try:
             descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -103,6 +121,11 @@ class OffsetCheckpoint:
         if not abs(checkpointed.y_offset_um) <= offset_max_um or checkpointed.seq < 0:
             self._refuse(f"offset {checkpointed.y_offset_um:g} µm, number {checkpointed.seq}")
             return None
+        for name, largest in (further_max or {}).items():
+            value = checkpointed.further.get(name, 0.0)
+            if not abs(value) <= largest:
+                self._refuse(f"offset of {name}: {value:g}")
+                return None
         return checkpointed
 
     def _refuse(self, why: str) -> None:

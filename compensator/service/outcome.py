@@ -8,19 +8,24 @@ from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.events import Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Probe, Sample, number
+from compensator.messages_axes import AxesEstimate, AxisOffset
 from compensator.model.engine import Estimate, Reference
 from compensator.service.state import ZeroState
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Outcome of one sample: the sample with final qualities, estimate, offset, events, and the decided probes."""
+    """Outcome of one sample: the sample with final qualities, estimate, offset, events, and the decided probes.
+
+    On a machine of several axes `offset` is that of Y, and `further` are those of the other axes.
+    """
 
     sample: Sample
     estimate: EstimateMessage
     offset: Offset
     notes: tuple[Note, ...]
     probes: tuple[Probe, ...] = ()
+    further: tuple[AxisOffset, ...] = ()
 
 
 @dataclass(slots=True)
@@ -75,10 +80,14 @@ def estimate_message(
     reference: Reference,
     zero: ZeroState,
     prediction: Prediction,
+    axes: dict[str, float | list[float] | None] | None = None,
 ) -> EstimateMessage:
-    """Return the estimate as a message: shares of the model, and the prediction with the correction by probes."""
+    """Return the estimate as a message: shares of the model, and the prediction with the correction by probes.
+
+    `axes` are the values of further axes by name; None on a machine with Y alone.
+    """
     y = values.y - zero.y_ref
-    return EstimateMessage(
+    own = EstimateMessage(
         schema=SCHEMA,
         machine=sample.machine,
         seq=sample.seq,
@@ -98,3 +107,6 @@ def estimate_message(
         y_um=y,
         residual_um=y - prediction.y_um,
     )
+    if axes is None:
+        return own
+    return AxesEstimate(**{name: getattr(own, name) for name in own.__struct_fields__}, axes=axes)

@@ -10,7 +10,7 @@ import json
 import logging
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from typing import Any, Literal, NamedTuple, Protocol
@@ -21,6 +21,7 @@ from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
 from compensator.events import CommandName
+from compensator.messages_axes import axis_of, topic_of
 from compensator.service.presence import sole_publisher
 from compensator.service.session import ALIVE, RETRY_S, error_text, log_links, session_config
 
@@ -99,6 +100,8 @@ class Publisher:
         Prefix, mode and endpoints.
     on_command : callable
         Called on a Zenoh thread with the name and payload of a command; returns the reply.
+    axes : sequence of str
+        Axes of the machine; empty where it has Y alone.
 
     Raises
     ------
@@ -106,8 +109,11 @@ class Publisher:
         By `open`, if an endpoint cannot be listened on, or another service of the machine is alive.
     """
 
-    def __init__(self, settings: Zenoh, on_command: CommandHandler) -> None:
+    def __init__(self, settings: Zenoh, on_command: CommandHandler, axes: Sequence[str] = ()) -> None:
         self._settings = settings
+        self._keys = _KEYS | {topic_of(axis): f"thermal/{axis}/offset" for axis in axes}
+        #: Names of the messages that are offsets.
+        self._offsets = tuple(name for name in self._keys if axis_of(name) is not None)
         self._on_command = on_command
         self._latest: dict[str, bytes] = {}
         self._session: zenoh.Session | None = None
@@ -118,7 +124,7 @@ class Publisher:
 
     def key(self, name: str) -> str:
         """Return the full key of a message or command."""
-        return f"{self._settings.prefix}/{_KEYS.get(name, f'thermal/command/{name}')}"
+        return f"{self._settings.prefix}/{self._keys.get(name, f'thermal/command/{name}')}"
 
     def open(self) -> None:
         """Open the session and declare everything.
@@ -144,8 +150,8 @@ class Publisher:
                 session = zenoh.open(session_config(self._settings))
                 unfinished.callback(session.close)
                 declared: list[_Declared] = [session.liveliness().declare_token(f"{self._settings.prefix}/{ALIVE}")]
-            publishers = {name: self._publisher(session, name) for name in _KEYS}
-            for name in ("offset", "status", "sample", "estimate"):
+            publishers = {name: self._publisher(session, name) for name in self._keys}
+            for name in (*self._offsets, "status", "sample", "estimate"):
                 declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
             for name in COMMANDS:
                 for key in (self.key(name), f"{self.key(name)}/*"):
@@ -160,7 +166,7 @@ class Publisher:
             self.key(name),
             encoding=zenoh.Encoding.APPLICATION_JSON,
             congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
+            priority=zenoh.Priority.INTERACTIVE_HIGH if name in self._offsets else zenoh.Priority.DATA,
             # Each express message takes a packet, and a router queues only a few packets: it would drop offsets if a
             # whole shop publishes at the same time. Express messages save no measurable time.
             express=False,

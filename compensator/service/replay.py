@@ -15,11 +15,11 @@ may be set and the computer may sleep, and neither counts as a pause for the ser
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -29,16 +29,17 @@ from compensator.config import Config, parse_config
 from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
 from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample
+from compensator.messages_axes import AxisOffset, RecordedOffsets, further_values
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Container, Contents, Damaged
-from compensator.recording.reading import RawRecord, decode_with, groups_of
+from compensator.recording.reading import RawRecord, decode, decode_with, groups_of
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.probing import ReceivedProbe
 from compensator.service.state import ZeroMode
 
 _SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
 _PROBE = msgspec.json.Decoder(Probe)
-_ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder(Offset)
+_OFFSET = msgspec.json.Decoder(Offset)
 
 
 @dataclass(slots=True)
@@ -52,13 +53,17 @@ class RecordedStep:
     run : dict of str to str
         Metadata of the file.
     records : dict of str to RawRecord
-        `sample`, `estimate`, `candidate` and `offset`, as far as present; a torn end lacks some.
+        `sample`, `estimate` and `offset`, as far as present; a torn end lacks some.
     events : list of Event
         Events. Those with smaller numbers were delayed by a full disk and are already in the state of the file.
     sample : Sample or None
         The sample; None for a held offset or for events alone.
     probes : list of (RawRecord, Probe)
         Probes that were decided with it; those with smaller numbers are already in the state of the file.
+    candidates : list of RawRecord
+        What the models in shadow made of it.
+    repeated : list of RawRecord
+        Records of a topic of which the group has a later one: the recorder writes one of each.
     """
 
     file: str
@@ -67,6 +72,8 @@ class RecordedStep:
     events: list[Event]
     sample: Sample | None
     probes: list[tuple[RawRecord, Probe]] = field(default_factory=list)
+    candidates: list[RawRecord] = field(default_factory=list)
+    repeated: list[RawRecord] = field(default_factory=list)
 
     def received_probes(self, *, checked: bool = False) -> list[ReceivedProbe]:
         """Return the probes of the sample as they arrived.
@@ -87,13 +94,25 @@ class RecordedStep:
     def estimate(self) -> EstimateMessage | None:
         """The model's estimate for the sample."""
         record = self.records.get("estimate")
-        return None if record is None else decode_with(_ESTIMATE, record, self.file)
+        return None if record is None else cast(EstimateMessage, decode(record, self.file))
 
     @property
     def offset(self) -> Offset | None:
         """The published offset."""
         record = self.records.get("offset")
         return None if record is None else decode_with(_OFFSET, record, self.file)
+
+    @property
+    def further(self) -> dict[str, float]:
+        """The published values of further outputs by name, each in its unit; NaN where there was none.
+
+        Nothing was published of a torn group, which lacks the offset of Y, the last record.
+        """
+        if "offset" not in self.records:
+            return {}
+        found = [decode(self.records[topic], self.file) for topic in ("offsets", "offset") if topic in self.records]
+        axes = [one for part in found for one in (part.messages() if isinstance(part, RecordedOffsets) else [part])]
+        return further_values(one for one in axes if isinstance(one, AxisOffset))
 
     @property
     def zero(self) -> ZeroMode | None:
@@ -113,16 +132,21 @@ def step_of(records: Sequence[RawRecord], contents: Contents, file: str) -> Reco
     DataError
         If its sample, an event or a probe does not follow its schema.
     """
-    found, events, probes = {}, [], []
+    found: dict[str, RawRecord] = {}
+    events, probes, candidates, repeated = [], [], [], []
     for record in records:
         if record.topic == "event":
             events.append(decode_with(_EVENT, record, file))
         elif record.topic == "probe":
             probes.append((record, decode_with(_PROBE, record, file)))
+        elif record.topic == "candidate":
+            candidates.append(record)
         else:
+            if record.topic in found:
+                repeated.append(found[record.topic])
             found[record.topic] = record
     sample = decode_with(_SAMPLE, found["sample"], file) if "sample" in found else None
-    return RecordedStep(file, contents.metadata.get("run", {}), found, events, sample, probes)
+    return RecordedStep(file, contents.metadata.get("run", {}), found, events, sample, probes, candidates, repeated)
 
 
 def steps_in(container: Container) -> Iterator[RecordedStep]:
@@ -269,6 +293,7 @@ class FreeRun:
         self._file = ""
         #: Offset before the sample of a torn end, whose own offset was not published.
         self._before_torn_um: float | None = None
+        self._further_before_torn: Mapping[str, float] = {}
 
     def run(self, step: RecordedStep, *, commands: bool = True) -> Outcome | Offset | None:
         """Run the next group, after the pause before it; see `apply`.
@@ -287,10 +312,14 @@ class FreeRun:
                 )
             if self._before_torn_um is not None:
                 own = compensation.status.handover
-                compensation.continue_from(replace(own, offset_um=self._before_torn_um, probing=None))
+                compensation.continue_from(
+                    replace(own, offset_um=self._before_torn_um, further=self._further_before_torn, probing=None)
+                )
             if self.seq >= 0:
                 self._pass_pause(step, sample)
-            self._before_torn_um = compensation.status.handover.offset_um if "offset" not in step.records else None
+            before = compensation.status.handover
+            self._before_torn_um = before.offset_um if "offset" not in step.records else None
+            self._further_before_torn = before.further
         elif self.seq >= 0 and step.offset is not None:
             # The first sample of a start failed: its group contains the pause and a held offset.
             self._pass_noted_pause(step, step.offset.seq)

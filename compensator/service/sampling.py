@@ -11,10 +11,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from statistics import median
 
-import numpy as np
-
-from compensator.arrays import Vector
 from compensator.clock import NS, Clock
 from compensator.codes import SampleQuality
 from compensator.config import Config
@@ -134,20 +132,21 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
     """Leave out single outliers; a slope over the sample is not an outlier."""
     if len(readings) < 5:
         return readings, 0
-    values = np.array([reading.value for reading in readings])
-    distance = np.abs(values - np.median(values))
-    sigma = float(np.median(distance)) / _MAD_OF_SIGMA
+    values = [reading.value for reading in readings]
+    middle = median(values)
+    distance = [abs(value - middle) for value in values]
+    sigma = median(distance) / _MAD_OF_SIGMA
     if sigma == 0.0:
         # Quantised and quiet: more than half of the values are equal; the step is the smallest difference.
-        steps = distance[distance > 0.0]
-        sigma = float(steps.min()) if steps.size > 1 else math.inf if _near(values) else 0.0
+        steps = [d for d in distance if d > 0.0]
+        sigma = min(steps) if len(steps) > 1 else math.inf if _near(values) else 0.0
     kept = [reading for reading, d in zip(readings, distance, strict=True) if d <= OUTLIER_SIGMA * sigma]
     return kept, len(readings) - len(kept)
 
 
-def _near(values: Vector) -> bool:
+def _near(values: list[float]) -> bool:
     """Return whether a single deviating reading among equal ones is a converter step, not an outlier."""
-    return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
+    return max(values) - min(values) <= 1e-3 * max(1.0, abs(median(values)))
 
 
 def _most_frequent(errors: Mapping[str, int]) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,6 +18,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
+from compensator.service.axes import OutputState
 from compensator.service.plausibility import JumpState, PlausibilityState
 from compensator.service.probing import ProbingState
 
@@ -111,6 +114,8 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
         State of the probes; omitted without `[probe]`, as in versions without probes.
     jumps : JumpState, optional
         State of the watch for jumps; omitted without `guards.suspect_jumps`, as in versions without it.
+    axes : dict of str to OutputState, optional
+        State of the further outputs by name; omitted on a machine with Y alone.
     """
 
     schema: int
@@ -124,15 +129,26 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     plausibility: PlausibilityState | None = None
     probing: ProbingState | None = None
     jumps: JumpState | None = None
+    axes: dict[str, OutputState] | None = None
 
 
 def encode_state(state: CompensationState) -> bytes:
     """Return a state as JSON."""
+    return frozen_state(state)()
+
+
+def frozen_state(state: CompensationState) -> Callable[[], bytes]:
+    """Copy a state; return what encodes the copy as JSON, which few samples need: those that open a file."""
     table = msgspec.to_builtins(state)
-    for name in ("plausibility", "probing", "jumps"):
+    for name in ("plausibility", "probing", "jumps", "axes"):
         if table[name] is None:
             del table[name]
-    return json.dumps(_encodable(table), separators=(",", ":")).encode()
+    # As in versions that knew Y alone.
+    branches = [table["jumps"][name] for name in ("believing", "shifted")] if state.jumps is not None else []
+    for kept in (table["memory"], *filter(None, branches)):
+        if kept["estimate"] is not None and not kept["estimate"]["outputs"]:
+            del kept["estimate"]["outputs"]
+    return lambda: json.dumps(_encodable(table), separators=(",", ":")).encode()
 
 
 def _encodable(value: Any) -> Any:
@@ -141,7 +157,12 @@ def _encodable(value: Any) -> Any:
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict):
         return {key: _encodable(entry) for key, entry in value.items()}
-    return [_encodable(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    if not isinstance(value, (list, tuple)):
+        return value
+    with suppress(TypeError, ValueError, OverflowError):  # not numbers, or two infinite ones
+        if math.isfinite(math.fsum(value)):  # a covariance has hundreds of numbers, nearly always all of them finite
+            return value
+    return [_encodable(entry) for entry in value]
 
 
 def decode_state(data: bytes) -> CompensationState:
@@ -164,6 +185,7 @@ def decode_state(data: bytes) -> CompensationState:
         engines += [branch.engine for branch in (state.jumps.believing, state.jumps.shifted) if branch is not None]
     nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
     numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
+    numbers += [value for one in (state.axes or {}).values() for value in (one.offset, one.base)]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
         raise DataError("state: a number of the offset or of the observer is not finite, or too large to be valid")
     return state

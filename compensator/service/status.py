@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field
 
 from compensator.messages import EstimateMessage, number
+from compensator.messages_axes import AxesEstimate, further_bases
 from compensator.model.engine import Reference
+from compensator.service.axes import OutputState
 from compensator.service.probing import ProbingHandover
 from compensator.service.state import ZeroMode, ZeroState
 
@@ -23,12 +26,15 @@ class Zero:
         Measured deformation, µm.
     y_base_um : float
         Predicted deformation at the last zero on a warm machine, µm.
+    further : mapping of str to float
+        Predicted value of each further output at that zero by its name, in its unit.
     """
 
     t_q_ref_degc: float
     at_ref_degc: float
     y_ref_um: float
     y_base_um: float
+    further: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of_estimate(cls, estimate: EstimateMessage) -> Zero:
@@ -38,6 +44,7 @@ class Zero:
             at_ref_degc=number(estimate.at_ref_degc),
             y_ref_um=number(estimate.y_ref_um),
             y_base_um=estimate.y_base_um,
+            further=further_bases(estimate) if isinstance(estimate, AxesEstimate) else {},
         )
 
     @classmethod
@@ -47,13 +54,14 @@ class Zero:
         return zero if zero is not None and not math.isnan(zero.t_q_ref_degc) else None
 
     @classmethod
-    def of_references(cls, reference: Reference, zero: ZeroState) -> Zero:
-        """Return the zero of a state, from the engine's reference and those of Y."""
+    def of_references(cls, reference: Reference, zero: ZeroState, axes: Mapping[str, OutputState]) -> Zero:
+        """Return the zero of a state, from the engine's reference, those of Y, and further outputs by name."""
         return cls(
             t_q_ref_degc=reference.t_q_degc,
             at_ref_degc=reference.at_degc,
             y_ref_um=zero.y_ref,
             y_base_um=zero.y_base,
+            further={name: one.base for name, one in axes.items()},
         )
 
     @property
@@ -63,8 +71,10 @@ class Zero:
 
     def equals(self, other: Zero) -> bool:
         """Return whether all values are equal; two unknown values count as equal."""
-        pairs = zip(astuple(self), astuple(other), strict=True)
-        return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+        *own, further = astuple(self)
+        *others, other_further = astuple(other)
+        pairs = zip(own, others, strict=True)
+        return further == other_further and all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +93,8 @@ class Handover:
         Whether the offset is still moving to that of another model.
     probing : ProbingHandover or None
         What the probes have shown; None if the successor keeps its own.
+    further : mapping of str to float
+        The last published values of further outputs by name; an output without one starts at 0.
     """
 
     offset_um: float = 0.0
@@ -91,6 +103,7 @@ class Handover:
     waiting_zero: ZeroMode | None = None
     model_changed: bool = False
     probing: ProbingHandover | None = None
+    further: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,7 +63,7 @@ class Source(NamedTuple):
 
 
 #: Keys that are queried: services answer them with the latest message.
-ASKED = ("y/offset", "status", "sample", "estimate")
+ASKED = ("*/offset", "status", "sample", "estimate")
 
 
 def below(prefix: str, rest: str) -> str:

@@ -181,6 +181,8 @@ function now(machine) {
     ["rate, µm/min", signed(machine.y_offset_rate_um_per_min)], ["standard deviation, µm", plain(machine.y_offset_std_um)],
     ["measured Y, µm", signed(machine.y_um)], ["predicted Y, µm", signed(machine.y_pred_um)],
     ["residual, µm", signed(machine.residual_um)],
+    ...(machine.axes ?? []).flatMap((one) => [[`${one.label} offset, ${one.unit}`, `${signed(one.offset)} (${one.state ?? "not received"})`],
+      ...("slope_um_per_m" in one ? [[`${one.label} slope, µm/m`, signed(one.slope_um_per_m)]] : [])]),
     ...machine.shares.map((share) => [`share ${share.name}, µm`, signed(share.y_um)]),
     ["heat, W", plain(machine.heat_w, 1)], ["T_Q, °C", plain(machine.t_q_degc)], ["AT, °C", plain(machine.at_degc)],
     ["alive", alive(machine)], ["messages received", String(machine.received)], ["messages missed", String(machine.missed)],

@@ -12,7 +12,9 @@ from msgspec import UNSET, UnsetType
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
-from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages import SCHEMA, EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
+from compensator.watch.axes import axis_snapshot, worst
 from compensator.watch.cutting import Headline, headline
 from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
@@ -29,7 +31,10 @@ from compensator.watch.words import (
 )
 
 #: Kinds of messages by the part of their key after `thermal/`.
-KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "status": "status", "event": "event"}
+KINDS = {
+    **{f"{axis}/offset": topic_of(axis) for axis in UNITS},
+    **{kind: kind for kind in ("sample", "estimate", "status", "event")},
+}
 #: Longest payload that is decoded, bytes; those of services are below 64 KiB.
 LONGEST = 2**20
 #: Events kept of each machine.
@@ -46,7 +51,11 @@ _OFFSET = ("state", "seq", "time_utc_ns", "valid_for_s", "y_offset_um", "y_offse
 _ESTIMATE = ("y_um", "y_pred_um", "residual_um", "heat_w", "heat_std_w")
 _STATUS = ("version", "model", "model_kind", "started_utc_ns", "recording", "devices")
 
-_DECODERS = {kind: msgspec.json.Decoder(MESSAGES[kind]) for kind in KINDS.values()}
+#: Where the newest message of each kind is kept.
+_KEPT = {"_sample": Sample, "_estimate": EstimateMessage, "_status": Status}
+_DECODERS = {kind: msgspec.json.Decoder(ALL_MESSAGES[kind]) for kind in KINDS.values()}
+#: Of Y on a machine of several axes.
+_OF_SEVERAL = msgspec.json.Decoder(OFFSETS["y"])
 
 
 class Malformed(ValueError):
@@ -64,7 +73,8 @@ def decoded(kind: str, payload: bytes) -> Any:
     if len(payload) > LONGEST:
         raise Malformed(f"{kind}: {len(payload)} bytes, expected at most {LONGEST}")
     try:
-        message: Any = _DECODERS[kind].decode(payload)
+        decoder = _OF_SEVERAL if kind == "offset" and names_axes(payload) else _DECODERS[kind]
+        message: Any = decoder.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise Malformed(f"{kind}: {error}") from error
     if message.schema != SCHEMA:
@@ -97,6 +107,8 @@ class WatchedMachine:
         self._sample: Sample | None = None
         self._estimate: EstimateMessage | None = None
         self._status: Status | None = None
+        #: Offsets of further axes.
+        self._axes: dict[str, AxisOffset] = {}
         self._arrived_s = 0.0
         #: Another machine name received below the same prefix, and when.
         self._other: tuple[str, float] = ("", -1e9)
@@ -109,7 +121,7 @@ class WatchedMachine:
         Parameters
         ----------
         kind : str
-            `offset`, `sample`, `estimate`, `status` or `event`.
+            `offset`, `sample`, `estimate`, `status` or `event`; `z_offset` and so on of further axes.
         payload : bytes
             JSON, or anything else.
         monotonic_s : float
@@ -123,6 +135,8 @@ class WatchedMachine:
             self.malformed += 1
             self.last_malformed = str(error)[:200]
             return False
+        if isinstance(message, AxisOffset) and kind != "offset":
+            return self._update_axis(axis_of(kind) or "", message)
         if message.machine != self.name and kind == "offset":
             if self._offset is not None:
                 self._other = (self.name, monotonic_s)
@@ -143,6 +157,14 @@ class WatchedMachine:
         self.history.prune(message.time_utc_ns)
         return True
 
+    def _update_axis(self, axis: str, message: AxisOffset) -> bool:
+        """Keep the newest offset of a further axis."""
+        known = self._axes.get(axis)
+        if known is not None and message.machine == known.machine and message.seq <= known.seq:
+            return False
+        self._axes[axis] = message
+        return True
+
     def _update_other(self, message: Sample | EstimateMessage | Status | Event) -> bool:
         """Add a message other than an offset; messages older than the last are ignored."""
         if isinstance(message, Event):
@@ -161,7 +183,8 @@ class WatchedMachine:
 
     def _keep(self, message: Sample | EstimateMessage | Status) -> bool:
         """Keep the newest message of its kind; return whether this is the newest."""
-        name = f"_{type(message).__name__.lower().removesuffix('message')}"
+        # Recorded estimates and status of several axes are subclasses.
+        name = next(name for name, kind in _KEPT.items() if isinstance(message, kind))
         known = getattr(self, name)
         if known is not None and message.machine == known.machine and message.seq <= known.seq:
             return False
@@ -190,7 +213,12 @@ class WatchedMachine:
         old_s = self.age_s(now_ns, monotonic_s)
         if self._offset is None or old_s is None:
             return WatchWarning.UNKNOWN
-        return WatchWarning.SILENT if old_s > self._offset.valid_for_s else self._offset.state
+        return WatchWarning.SILENT if old_s > self._offset.valid_for_s else self._worst()[0]
+
+    def _worst(self) -> tuple[str, list[str]]:
+        """Return the worst state of all axes of the last sample, and the reasons of all."""
+        assert self._offset is not None
+        return worst(self._offset, self._axes)
 
     def warnings(self, now_ns: int, monotonic_s: float) -> list[Remark]:
         """Return warnings about what was received."""
@@ -266,7 +294,7 @@ class WatchedMachine:
         offset, status = self._offset, self._status
         shown = self.shown(now_ns, monotonic_s)
         old_s = self.age_s(now_ns, monotonic_s)
-        reasons = explained_together(offset.reasons) if offset else []
+        reasons = explained_together(self._worst()[1]) if offset else []
         warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
             "prefix": self.prefix,
@@ -298,6 +326,8 @@ class WatchedMachine:
         loop = self._loop(status) if self._fresh(status, now_ns) else None
         if loop is not None:
             found["loop"] = loop
+        if isinstance(offset, AxisOffset):
+            found["axes"] = axis_snapshot(offset, self._axes, silent=shown == WatchWarning.SILENT)
         found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
         return found | {name: getattr(status, name, None) for name in _STATUS}
 
@@ -308,7 +338,7 @@ class WatchedMachine:
         return headline(
             shown=shown,
             tone=_tone(shown, warnings),
-            reasons=self._offset.reasons if self._offset is not None else (),
+            reasons=self._worst()[1] if self._offset is not None else (),
             channels=self._measured(now_ns)["channels"],
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 from compensator import __version__
 from compensator.clock import Clock
 from compensator.events import EventKind
-from compensator.messages import MESSAGES, shipped_schema
+from compensator.messages import shipped_schema
+from compensator.messages_axes import ALL_MESSAGES, axis_of
 from compensator.recording.compaction import rewrite
 from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.live_file import LiveFile
@@ -184,13 +185,16 @@ class ShopRecorder:
         if message is None:
             return "other", 0, arrival.time_ns
         numbers = self._numbers
-        if kind in ("offset", "sample", "estimate"):
+        if kind in ("sample", "estimate") or axis_of(kind) is not None:
             numbers.setdefault((prefix, rest), Sequence()).update(message.seq, message.time_utc_ns)
         started_ns = message.started_utc_ns if kind == "status" else 0
         if kind == "event" and message.kind == EventKind.START:
             started_ns = message.time_utc_ns
         for other in ("y/offset", "sample", "estimate") if started_ns else ():
             numbers.setdefault((prefix, other), Sequence()).started(started_ns)
+        for (its_prefix, other), sequence in numbers.items() if started_ns else ():
+            if its_prefix == prefix and other.endswith("/offset") and other != "y/offset":
+                sequence.started(started_ns)
         return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
 
     def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
@@ -253,10 +257,10 @@ class _File(LiveFile):
 
     def _register(self, topic: str, kind: str, key: str) -> int:
         schema = 0
-        if kind in MESSAGES or kind == "alive":
+        if kind in ALL_MESSAGES or kind == "alive":
             if kind not in self._schemas:
-                data = shipped_schema(kind) if kind in MESSAGES else ALIVE
-                name = MESSAGES[kind].__name__ if kind in MESSAGES else "Alive"
+                data = shipped_schema(kind) if kind in ALL_MESSAGES else ALIVE
+                name = ALL_MESSAGES[kind].__name__ if kind in ALL_MESSAGES else "Alive"
                 self._schemas[kind] = self.writer.register_schema(name, "jsonschema", data)
             schema = self._schemas[kind]
         encoding = "octet-stream" if kind == "other" else "json"

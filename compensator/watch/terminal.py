@@ -18,7 +18,7 @@ from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, probe_text
+from compensator.watch.words import SIGNS, TONES, age, probe_text
 
 #: Columns of the table of a shop: heading, minimum width of the terminal.
 _COLUMNS = (
@@ -209,6 +209,7 @@ def detail(
     parts += [
         Text(""),
         numbers,
+        *_axes(machine),
         *([Text(probe_text(machine["probe"]))] if machine["probe"] is not None else []),
         *(Text(line) for line in _loop_lines(machine)),
         *([] if short else [Text(_about(machine), style="dim")]),
@@ -218,6 +219,27 @@ def detail(
     return Panel(
         Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=STYLES[machine["tone"]]
     )
+
+
+def _axes(machine: dict[str, Any]) -> list[RenderableType]:
+    """Return a table of every axis of a machine that has several."""
+    if not machine.get("axes"):
+        return []
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for name in ("axis", "state", "offset", "per min", "std", "slope", "reasons"):
+        table.add_column(name, justify="right" if name in ("offset", "per min", "std", "slope") else "left")
+    for axis in machine["axes"]:
+        slope = f"{signed(axis['slope_um_per_m'])} µm/m" if "slope_um_per_m" in axis else ""
+        table.add_row(
+            axis["label"],
+            Text(axis["state"] or "not received", style=STYLES[TONES.get(axis["state"] or "", "bad")]),
+            f"{signed(axis['offset'])} {axis['unit']}",
+            signed(axis["rate_per_min"]),
+            plain(axis["std"]),
+            slope,
+            " ".join(axis["reasons"]),
+        )
+    return [Text(""), table]
 
 
 def _loop_lines(machine: dict[str, Any]) -> list[str]:
@@ -332,6 +354,11 @@ def line(machine: dict[str, Any]) -> str:
         machine["shown"],
         f"offset {signed(machine['y_offset_um'])} µm ({old})",
         f"residual {signed(machine['residual_um'])} µm",
+        *(
+            f"{axis['label']} {signed(axis['offset'])} {axis['unit']}"
+            for axis in machine.get("axes", ())
+            if axis["axis"] != "y"
+        ),
         *(reason["code"] for reason in machine["reasons"]),
         *(["probe wanted"] if machine["probe"] is not None and machine["probe"]["wanted"] else []),
         *(["better model proposed"] if machine.get("loop", {}).get("phase") == "proposed" else []),

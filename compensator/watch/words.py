@@ -150,6 +150,9 @@ def loop_text(loop: Mapping[str, Any]) -> str:
         "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {why}.",
     }
     text = words[loop["phase"]]
+    if loop.get("before_effects") is not None:
+        before = ", ".join(loop["before_effects"]) or "no added effect"
+        text += f" The one before the last change ({before}) goes on, too: {loop['before_text']}."
     return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text
 
 

@@ -27,10 +27,13 @@ KEYS = {
     "receiver": {"name", "machines"},
     "operator": {"name", "machines"},
     "probe": {"name", "machines"},
+    "tool": {"name", "machines"},
 }
 #: What a receiver may query; anything else below a prefix is published or is a command.
-ANSWERED = ("thermal/y/offset", "thermal/status", "thermal/sample", "thermal/estimate")
+ANSWERED = ("thermal/*/offset", "thermal/status", "thermal/sample", "thermal/estimate")
 
+#: What a control publishes of its tool, and a receiver may query, too.
+TOOL_LENGTH = "thermal/tool_length"
 #: Largest list, bytes.
 LONGEST = 1_000_000
 #: Most points in a line of it.
@@ -64,7 +67,7 @@ def machine_rules(machine: dict[str, Any]) -> list[dict[str, Any]]:
 def reading_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
     """Let a receiver subscribe, and query the latest and who is alive; it may send nothing else."""
     below = [prefix if prefix == "**" else f"{prefix}/**" for prefix in prefixes]
-    asked = [f"{prefix}/{key}" for prefix in prefixes for key in ANSWERED]
+    asked = [f"{prefix}/{key}" for prefix in prefixes for key in (*ANSWERED, TOOL_LENGTH)]
     subscribes = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     return [
         rule(f"{name} subscribes", "ingress", subscribes, below),
@@ -89,11 +92,27 @@ def probe_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
     return [rule(f"{name} probes", "ingress", ["query"], own), rule(f"{name} is answered", "egress", ["reply"], own)]
 
 
+def tool_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
+    """Let a control publish the length of the tool in its spindle, and answer with it; it may read nothing."""
+    own = [f"{prefix}/{TOOL_LENGTH}" for prefix in prefixes]
+    return [
+        rule(f"{name} publishes", "ingress", ["put", "reply", "declare_queryable"], own),
+        rule(f"{name} is asked", "egress", ["query"], own),
+        # Who subscribes to more than the length would not be found else.
+        rule(f"{name} is heard", "egress", ["declare_subscriber"], ["**"]),
+    ]
+
+
 def access_control(shop: dict[str, Any]) -> dict[str, Any]:
     """Return Zenoh's access list."""
     machines = {machine["name"]: machine for machine in shop["machine"]}
     rules: dict[str, list[dict[str, Any]]] = {name: machine_rules(machine) for name, machine in machines.items()}
-    for role, make in (("receiver", reading_rules), ("operator", operator_rules), ("probe", probe_rules)):
+    for role, make in (
+        ("receiver", reading_rules),
+        ("operator", operator_rules),
+        ("probe", probe_rules),
+        ("tool", tool_rules),
+    ):
         for client in shop.get(role, []):
             # Zenoh passes a subscription or query only where one rule includes all of it.
             prefixes = [machines[name]["prefix"] for name in client["machines"]] if "machines" in client else ["**"]

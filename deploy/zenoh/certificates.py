@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make a small certificate authority and the certificates of router, machines, receivers, operators and probes.
+"""Make a small certificate authority and the certificates of router, machines, receivers, operators, probes and tools.
 
 The router's access list goes by the common name of each certificate. Keys are written with mode 0600. Running it again
 keeps what is there and valid, and makes only what is missing; `--renew` replaces certificates with less than
@@ -28,7 +28,7 @@ try:
 except ImportError:
     sys.exit("certificates.py: needs the package cryptography: pip install quill-compensator[tls]")
 
-ROLES = ("machine", "receiver", "operator", "probe")
+ROLES = ("machine", "receiver", "operator", "probe", "tool")
 #: Largest file of a key or certificate, bytes.
 LONGEST = 100_000
 CLOCK_SKEW = datetime.timedelta(hours=1)

@@ -1,5 +1,6 @@
 """A simulated machine: conduction, the published functions, duties, sensors and undeclared effects."""
 
+from sim_hardware.physics.axes import Growth, MachineOfAxes
 from sim_hardware.physics.conduction import QuillMachine
 from sim_hardware.physics.design import QuillDesign
 from sim_hardware.physics.duty import Duty
@@ -11,7 +12,9 @@ from sim_hardware.physics.world import World
 
 __all__ = [
     "Duty",
+    "Growth",
     "Inputs",
+    "MachineOfAxes",
     "Plant",
     "PublishedQuill",
     "QuillDesign",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
@@ -44,19 +42,20 @@ class Duty:
         n = int(np.ceil(duration_s / GRID_S)) + 1
         self.columns: dict[str, Array] = {k: np.broadcast_to(v, n).astype(np.float64) for k, v in columns.items()}
         self.extra_names = [name for name in columns if name not in CHANNELS]
-        named = [name for name in columns if name in CHANNELS]
-        parts = zip(*(self.columns[name].tolist() for name in named), strict=True) if named else ((),) * n
-        values = [dict(zip(named, row, strict=True)) for row in parts]
-        others: list[Mapping[str, float]] = [{} for _ in range(n)]
-        if self.extra_names:
-            rows = zip(*(self.columns[name].tolist() for name in self.extra_names), strict=True)
-            others = [dict(zip(self.extra_names, row, strict=True)) for row in rows]
-        self._inputs = [Inputs(**v, extras=x) for v, x in zip(values, others, strict=True)]
+        self._named = [name for name in columns if name in CHANNELS]
+        #: Inputs of each time that was asked for: days are drawn long, and few of them are run to their end.
+        self._inputs: list[Inputs | None] = [None] * n
 
     def at(self, t_s: float) -> Inputs:
         """Return the inputs at a time, s."""
         # A microsecond of slack, so that sums of steps such as 0.1 s do not fall short of the grid.
-        return self._inputs[min(max(int((t_s + 1e-6) / GRID_S), 0), len(self._inputs) - 1)]
+        i = min(max(int((t_s + 1e-6) / GRID_S), 0), len(self._inputs) - 1)
+        inputs = self._inputs[i]
+        if inputs is None:
+            extras = {name: float(self.columns[name][i]) for name in self.extra_names}
+            inputs = Inputs(**{name: float(self.columns[name][i]) for name in self._named}, extras=extras)
+            self._inputs[i] = inputs
+        return inputs
 
     @classmethod
     def step(cls, heat_w: float = 90.0, hours: float = 24.0, ambient_degc: float = REST_DEGC) -> Duty:

@@ -37,7 +37,7 @@ def run(capfd: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
 
 def test_the_same_figure_and_words_everywhere(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     data, model = folder / "effect.csv", tmp_path / "model.toml"
-    identified = run(capfd, "identify", folder / "run.csv", "--validate", data, "--order", 2, 2, 2, "--out", model)
+    identified = run(capfd, "identify", folder / "run.csv", "--validate", data, "--order", 1, 1, 1, "--out", model)
     simulated = run(capfd, "simulate", data, "--model", model, "--out", tmp_path / "out.csv")
     compared = run(capfd, "compare", data, "--model", model, "--model", "quill", "--page", tmp_path / "compared.html")
     diagnosed = run(capfd, "diagnose", data, "--model", model, "--out", tmp_path / "d")
@@ -98,7 +98,7 @@ def test_compare_names_models_and_writes_curves(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     same = tmp_path / "same.toml"
-    main(["identify", str(folder / "run.csv"), "--order", "2", "2", "2", "--out", str(same), "--name", "quill"])
+    main(["identify", str(folder / "run.csv"), "--order", "1", "1", "1", "--out", str(same), "--name", "quill"])
     capfd.readouterr()
     out = tmp_path / "curves.csv"
     found = run(capfd, "compare", folder / "run.csv", "--model", "quill", "--model", same, "--out", out)

@@ -69,7 +69,8 @@ def rechained(
     path.unlink()
     machine = contents.run["machine"]
     topics = [channel.topic[1:] for channel in contents.channels.values()]
-    live = RecordingFile([path], machine, made[0], lines[0].time_ns, topics)
+    axes = ["y"] if "offsets" in topics else []  # its messages are those of several axes
+    live = RecordingFile([path], machine, made[0], lines[0].time_ns, topics, axes)
     live.begin(contents.run, list(contents.attachments.values()))
     for group in made[1]:
         live.append([(line.topic, line.data) for line in group], group[0].time_ns)

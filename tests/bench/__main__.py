@@ -1,6 +1,6 @@
 """All figures of the project, in one table at the end: `make bench`. Nothing passes or fails here.
 
-python -m tests.bench                    everything but `drawn` and `loop`, which take hours
+python -m tests.bench                    everything but `drawn` and `loop`, which take hours, and `axes_effects`
 python -m tests.bench speed diagnosis    some of it
 python -m tests.bench drawn --help       drawn machines, with options of their own
 python -m tests.bench loop --help        the loop over machine-weeks, too
@@ -12,6 +12,8 @@ from compensator.blas import in_one_thread
 from compensator.commands.stopping import stoppable
 from tests.bench import (
     audit,
+    axes,
+    axes_effects,
     diagnosis,
     drawn,
     faults,
@@ -46,8 +48,12 @@ AREAS = {
     "faults": faults.report,
     "sensor_faults": sensor_faults.report,
     "audit": audit.report,
+    "axes": axes.report,
+    "axes_effects": axes_effects.report,
     "shop": shop.report,
 }
+#: Not made without being asked for.
+LONG = ("drawn", "loop", "axes_effects")
 
 
 def main(chosen):
@@ -61,7 +67,7 @@ def main(chosen):
     print(where + "\n", flush=True)
     figures = []
     try:
-        for name in chosen or [name for name in AREAS if name not in ("drawn", "loop")]:
+        for name in chosen or [name for name in AREAS if name not in LONG]:
             figures.extend(AREAS[name]())
     finally:  # what was measured in an hour is not lost with what goes wrong after it
         print(f"\n{where}\n\n{table(figures)}")

@@ -50,6 +50,8 @@ def one(model, own_um, seed, size_um):
         return None, named, np.nan, seconds
     truth = effects[0].reveal().describe()
     place = tuple(str(truth.get(key) or "") for key in ("kind", "path", "channel"))
+    if place[0] not in LASTING:
+        return place, named, np.nan, seconds
     tables = [term.effect for term in terms if term.effect.deployable]
     fresh = runs(Duty.working_day(700 + seed, hours=24.0), 800 + seed, effects)[0]
 
@@ -57,7 +59,7 @@ def one(model, own_um, seed, size_um):
         return float(np.var(fresh.y_um - predict(candidate, fresh)))
 
     before = error(model) - own_um**2
-    if place[0] not in LASTING or before < 0.5 * own_um**2:
+    if before < 0.5 * own_um**2:
         return place, named, np.nan, seconds
     return place, named, (error(dataclasses.replace(model, effects=tuple(tables))) - own_um**2) / before, seconds
 

@@ -36,6 +36,11 @@ class Plc:
         self.state = await add("/Plc/DB100.DBW6", 0, ua.VariantType.UInt16)
         self.enable = await add("/Plc/DB100.DBX8.0", True, ua.VariantType.Boolean)
         self.probe_wanted = await add("/Plc/DB100.DBX8.1", False, ua.VariantType.Boolean)
+        # What a PLC of several axes has besides.
+        self.z = await add("/Plc/DB100.DBD12:REAL", self.start, self.kind)
+        self.slope = await add("/Plc/DB100.DBD16:LREAL", 0.0, ua.VariantType.Double)
+        self.tool_mm = await add("/Plc/DB100.DBD24:REAL", 0.0, ua.VariantType.Float)
+        self.cutting = await add("/Plc/DB100.DBX8.2", True, ua.VariantType.Boolean)
         await self.server.start()
         subscription = await self.server.create_subscription(10, self)
         await subscription.subscribe_data_change(self.offset, queuesize=1000)

@@ -5,9 +5,12 @@ import json
 
 import pytest
 
+import compensator as tc
 from compensator.axes import AxisWords
 from compensator.cli import main
 from compensator.codes import DataRemark, Remark
+from compensator.data.axes import words_of
+from compensator.data.measurement import measurements
 from compensator.display import Table, Words
 from compensator.errors import DataError
 from compensator.model.model_file import load_axes, load_model, parse_axes
@@ -118,6 +121,32 @@ def test_axes_of_one_file_have_one_heat(folder):
     models, quill = load_axes(folder / "machine.toml"), load_model("quill")
     with pytest.raises(Exception, match="differs from that of axis"):
         dump_axes({"y": quill, "x": models["x"]})
+
+
+def test_texts_of_an_axis_keep_channels_and_models_of_the_user():
+    table = machine(axes=("y", "z"))
+    table |= dict.fromkeys(("y_scale_um", "motor Y", "Y", "y_pred_um", "r"), table["at_degc"])
+    words = words_of("z", measurements(table, "data"), models=["mill Y"])
+    text = "y_scale_um, motor Y and mill Y; Y, y_um, y_pred_um, residual_um, y_scale_um_2"
+    assert words(text) == "y_scale_um, motor Y and mill Y; Z, z_um, z_pred_um, z_residual_um, z_scale_um_2"
+    assert words({"channel": "y_scale_um", "why": "y_scale_um moves Y"}) == {
+        "channel": "y_scale_um",
+        "why": "y_scale_um moves Z",
+    }
+
+
+@pytest.mark.parametrize("axis", ["z", "ch1", "y_slope"])
+def test_texts_of_an_axis_are_made_once(axis):
+    words = AxisWords(axis)
+    text = words("no y_um; Y, y_pred_um, residual_um")
+    assert text == f"no {axis}_um; {axis if axis != 'z' else 'Z'}, {axis}_pred_um, {axis}_residual_um"
+    assert words(text) == text
+
+
+def test_a_comparison_keeps_the_names_of_models(folder):
+    models = {"mill Y": folder / "machine.toml", "again": folder / "machine.toml"}
+    found = tc.compare(models, str(folder / "second.csv"), axis="z")
+    assert "mill Y" in found.summary() and "mill Z" not in found.summary()
 
 
 def test_texts_of_an_axis_keep_names_of_the_user_codes_and_options():

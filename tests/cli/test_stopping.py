@@ -92,3 +92,23 @@ def test_ends_when_started_with_the_signals_ignored_and_blocked(
         process.kill()
         process.communicate()
     assert process.returncode == 0 and "Traceback" not in shown, shown
+
+
+#: Waits while another process sends signals one after another: a handler that needs a lock meets itself.
+STORMED = """
+import os, subprocess, sys
+from compensator.commands.stopping import until_stopped
+storm = "import os, sys\\nwhile True: os.kill(int(sys.argv[1]), 15)"
+with until_stopped() as stop:
+    sender = subprocess.Popen([sys.executable, "-c", storm, str(os.getpid())])
+    try:
+        for _ in range(1000):
+            assert stop.wait(10.0)
+    finally:
+        sender.kill()
+        sender.wait()
+"""
+
+
+def test_a_signal_that_comes_while_a_program_waits_for_it_does_not_lock_it_up() -> None:
+    subprocess.run([sys.executable, "-c", STORMED], timeout=60, check=True)

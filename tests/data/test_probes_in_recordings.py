@@ -95,7 +95,7 @@ async def test_an_exported_table_has_the_probes_of_the_recording(tmp_path: Path,
 
 async def test_a_measured_y_is_exported_as_it_was(tmp_path: Path) -> None:
     machine = ProbedMachine(
-        tmp_path, noise_um=0.0, config=CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0") + PROBE
+        tmp_path, noise_um=0.0, config=CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 60.0") + PROBE
     )
     machine.at_sample[60] = machine.probe
     await machine.run(90)

@@ -25,7 +25,7 @@ from tests.diagnose.scenarios import Scenario, lag, record, signals
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
-HOURS = 36.0
+HOURS = 24.0
 
 
 def machine(act, seed, hours=HOURS, **changed):

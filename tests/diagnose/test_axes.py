@@ -25,7 +25,7 @@ PLACE = ("input", "", "coolant_degc")
 
 @pytest.fixture(scope="module")
 def found():
-    return tc.diagnose(models(), machine(1, {"y": 2.0, "z": -4.0}))
+    return tc.diagnose(models(), machine(1, {"y": 2.0, "z": -4.0}, hours=24.0))
 
 
 def test_an_effect_of_two_axes_is_named_with_its_axes(found):
@@ -41,14 +41,14 @@ def test_an_effect_of_two_axes_is_named_with_its_axes(found):
 def test_each_axis_gets_its_own_effect_in_one_file(found, tmp_path):
     loaded = load_axes(found.save(tmp_path / "model.toml"))
     assert [len(loaded[axis].effects) for axis in ("x", "y", "z")] == [0, 1, 1]
-    table = machine(1, {"y": 2.0, "z": -4.0})
+    table = machine(1, {"y": 2.0, "z": -4.0}, hours=24.0)
     before, after = tc.simulate(models(), table), tc.simulate(loaded, table)
     for axis in ("y", "z"):
         assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
 
 
 def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
-    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}))
+    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}, hours=18.0))
     [effect] = found.machine
     assert effect.place[0] == "step" and effect.suspect == "z"
     assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
@@ -66,7 +66,7 @@ def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():
 
 
 def test_y_alone_is_diagnosed_as_without_the_other_axes():
-    table = machine(1, {"y": 2.0, "z": -4.0})
+    table = machine(1, {"y": 2.0, "z": -4.0}, hours=12.0)
     alone = tc.diagnose(models()["y"], {name: v for name, v in table.items() if name not in ("x_um", "z_um")})
     chosen = tc.diagnose(models(), table, axis="y")
     assert chosen.to_dict() | {"free_run": []} == alone.to_dict() | {"free_run": []}
@@ -88,7 +88,7 @@ def test_what_another_axis_shows_is_no_choice_among_many():
 
 
 def test_the_command_writes_the_axis_of_each_effect(tmp_path, capsys):
-    write(tmp_path / "run.csv", {k: np.asarray(v) for k, v in machine(1, {"y": 2.0, "z": -4.0}).items()})
+    write(tmp_path / "run.csv", {k: np.asarray(v) for k, v in machine(1, {"y": 2.0, "z": -4.0}, hours=18.0).items()})
     write_axes(tmp_path / "base.toml", models())
     out = tmp_path / "found"
     arguments = ["diagnose", str(tmp_path / "run.csv"), "--model", str(tmp_path / "base.toml"), "--out", str(out)]

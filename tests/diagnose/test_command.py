@@ -15,7 +15,7 @@ from tests.diagnose.scenarios import draw, record
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    columns, _, _ = record([draw("scheduled", 3), draw("drift", 3)], 77)
+    columns, _, _ = record([draw("scheduled", 3), draw("drift", 3)], 77, 24.0)
     path = tmp_path_factory.mktemp("data") / "run.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
     return path
@@ -55,8 +55,8 @@ def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
     assert main(["diagnose", str(table), "--model", str(base), "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["effects"][1]["kind"] == "drift"
     # The drift is of the measurement: what the service states is the error on the machine.
-    _, drifted, _ = record([draw("scheduled", 3), draw("drift", 3)], 77)
-    _, scheduled, _ = record([draw("scheduled", 3)], 77)
+    _, drifted, _ = record([draw("scheduled", 3), draw("drift", 3)], 77, 24.0)
+    _, scheduled, _ = record([draw("scheduled", 3)], 77, 24.0)
     assert load_model(out / "model.toml").y_std_um < 0.1 * np.std(drifted - scheduled)
     again = tmp_path / "second"
     assert main(["diagnose", str(table), "--model", str(out / "model.toml"), "--out", str(again), "--json"]) == 0
@@ -66,7 +66,7 @@ def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
 
 
 def test_an_adequate_model_is_written_with_the_deviation_that_the_data_show(tmp_path, capsys):
-    columns, _, _ = record([], 78, 24.0)
+    columns, _, _ = record([], 78, 14.0)
     path = tmp_path / "run.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
     assert main(["diagnose", str(path), "--model", "quill", "--out", str(tmp_path / "d"), "--json"]) == 0
@@ -84,7 +84,7 @@ def test_an_adequate_model_is_written_with_the_deviation_that_the_data_show(tmp_
 
 def test_a_reversed_y_is_no_effect_of_the_machine(tmp_path, capsys):
     """Deployed, the gains that reverse both paths would double the error of the part."""
-    columns, _, _ = record([], 80, 24.0)
+    columns, _, _ = record([], 80, 12.0)
     path, out = tmp_path / "run.csv", tmp_path / "d"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns, "y_um": -columns["y_um"]})
     assert main(["diagnose", str(path), "--model", "quill", "--out", str(out), "--json"]) == 0

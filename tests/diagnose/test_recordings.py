@@ -55,11 +55,14 @@ def test_a_recording_does_not_foretell_itself():
 
 
 def test_the_diagnosis_says_how_it_was_measured():
-    tables, runs = recordings(10.0, 8.0, 9.0)
+    _, runs = recordings(10.0, 8.0, 9.0)
     found = diagnose(QUILL, runs)
     assert [effect.place for effect in found.effects] == [("gain", "DTF", "")]
     assert found.held_out.startswith("each of 3 recordings")
     assert found.after.rms_um < 0.2 * found.before.rms_um
-    # The same by the Python face, which knows recordings by their files.
+
+
+def test_the_python_face_knows_recordings_by_their_files():
+    tables, _ = recordings(6.0, 5.0, 6.0)
     data = [{"t_s": np.arange(t["y_um"].size) * 60.0, **t} for t in tables]
-    assert tc.diagnose(QUILL, data).to_dict()["held_out"] == found.held_out
+    assert tc.diagnose(QUILL, data).to_dict()["held_out"].startswith("each of 3 recordings")

@@ -24,7 +24,7 @@ KINDS = ["nonlinear", "scheduled"]
 
 
 @functools.cache
-def warm(kind, *, size_um=6.0, hours=36.0):
+def warm(kind, *, size_um=6.0, hours=24.0):
     """A day that begins when the machine has worked for 6 to 12 h and is warm."""
     scenario = draw(kind, 5, size_um)
     columns, _, _ = record([scenario], 1305, hours + 12.0)
@@ -63,7 +63,7 @@ def test_the_user_is_told_from_where_the_effect_counts(kind):
 
 def test_the_free_run_of_the_extended_model_begins_as_warm_as_the_record():
     columns = warm("nonlinear")[1]
-    result = tc.diagnose("quill", {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}, fit_until_h=24.0)
+    result = tc.diagnose("quill", {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}, fit_until_h=16.0)
     for rows in result.free_run:
         assert rows.scores["extended model"].rms_about_mean_um < 0.5 * rows.scores["base model"].rms_about_mean_um
 

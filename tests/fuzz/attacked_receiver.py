@@ -44,6 +44,7 @@ class Result:
     payloads: int = 0
     dropped: int = 0
     restarted: int = 0
+    used: int = 0
 
 
 class Attack:

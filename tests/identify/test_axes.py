@@ -7,12 +7,15 @@ import pytest
 from scipy.signal import lfilter
 
 import compensator as tc
-from compensator.errors import DataError, ModelError, UsageError
+from compensator.config import parse_config
+from compensator.errors import ConfigError, DataError, ModelError, UsageError
 from compensator.identify.output_error import Segment, Structure, fit_output_error
 from compensator.identify.pairs import pairs
 from compensator.identify.shared_poles import fit_shared
 from compensator.model.model_file import load_axes, load_model
+from compensator.tilt_lines import tilt_lines
 from tests.identify.axes_data import machine
+from tests.service.several import AXES, config_text
 
 SPINDLE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 
@@ -153,6 +156,36 @@ def test_three_probes_that_move_alike_show_no_pair():
     assert "against each other" in str(pair) and "contradict" in str(pair)
     assert not list(pairs(two | {"p4": [1.1 * slow]}, 60.0)), "which of three are the pair cannot be seen"
     assert not list(pairs({"x": [slow], "y": [slow], "p3": [other]}, 60.0)), "X and Y have directions of their own"
+    [pair] = pairs(two | {"y_slope": [slow]}, 60.0)
+    assert (pair.first, pair.second) == ("p1", "p2"), "the slope of an axis is no probe"
+
+
+def test_the_lines_of_a_tilt_are_a_configuration_once_they_are_filled_in(tmp_path):
+    table = machine(axes=("y",))
+    low = table.pop("y_um")
+    found = tc.identify(table | {"p1_um": low, "p2_um": 1.5 * low + 2.0}, axis=["p1", "p2"], order=(1, 1, 1))
+    lines = found.tilt_lines()
+    assert 'probes = ["p1", "p2"]' in lines and lines in found.summary() and "[axis.b]" not in lines
+    assert f"seen: {0.5 * np.ptp(low):.1f} µm" in lines
+    assert "axis.a" in found.page(tmp_path / "page.html").read_text(encoding="utf-8")
+    text = config_text(AXES, lines).decode()
+    with pytest.raises(ConfigError, match=r"axis\.a\.\w+ = 'FILL IN'") as error:
+        parse_config(text.encode(), source="machine.toml")
+    assert "\n" not in str(error.value)
+    config = parse_config(text.replace('"FILL IN"', "150.0").encode(), source="machine.toml")
+    assert config.axis.a.probes == ("p1", "p2") and config.axis.a.distance_mm == 150.0
+    parts = load_axes(found.save(tmp_path / "machine.toml"))
+    assert set(config.axis.a.probes) <= set(parts)
+
+
+def test_probes_that_move_against_each_other_are_said_in_the_lines():
+    slow = np.cumsum(np.random.default_rng(2).normal(0.0, 1.0, 1500))
+    [pair] = pairs({"p1": [slow], "p2": [-0.7 * slow]}, 60.0)
+    assert pair.apart_um == pytest.approx(1.7 * np.ptp(slow))
+    both = ("p1", "p2")
+    assert "against each other" in tilt_lines([(*both, 1.0)], against=[both])
+    assert "against each other" not in tilt_lines([(*both, 1.0)])
+    assert tilt_lines([(*both, 1.0)] * 3).count("[axis.") == 2, "a machine has two tilts"
 
 
 @pytest.mark.skipif(not SPINDLE.exists(), reason="the measured spindle is not here")
@@ -162,5 +195,6 @@ def test_five_probes_of_the_measured_spindle_in_one_command():
     found = tc.identify(SPINDLE, columns=roles, axis=probes)
     assert {frozenset(group) for group in found.shared} == {frozenset(("ch1", "ch2")), frozenset(("ch3", "ch4"))}
     assert [(one.first, one.second) for one in found.pairs] == [("ch1", "ch2"), ("ch3", "ch4")]
+    assert "[axis.a]" in found.tilt_lines() and 'probes = ["ch3", "ch4"]' in found.tilt_lines().split("[axis.b]")[1]
     for axis, result in found.items():
         assert result.calibration.folds_rms_um <= 1.005 * found.alone_rms_um[axis], axis

@@ -51,11 +51,17 @@ class Period(NamedTuple):
     on: bool
 
 
+def period(words: list[str]) -> Period:
+    """Read what `SAMPLER` writes of a servo period."""
+    return Period(*(1000.0 * float(word) for word in words[:4]), on=words[4] == "1")
+
+
 class Control:
     """A running LinuxCNC."""
 
-    def __init__(self, folder: Path, path: str) -> None:
+    def __init__(self, folder: Path, path: str, read: Callable[[list[str]], Any]) -> None:
         self.folder = folder
+        self._read = read
         self._socket = socket.socket(socket.AF_UNIX)
         self._path = path
         self._lines: Any = None
@@ -117,9 +123,9 @@ class Control:
         return self._samples.stat().st_size
 
     @contextmanager
-    def watched(self) -> Iterator[list[Period]]:
+    def watched(self) -> Iterator[list[Any]]:
         """Every servo period while this lasts; the list is full when it ends."""
-        found: list[Period] = []
+        found: list[Any] = []
         begin = self._later()
         yield found
         end = self._later()
@@ -133,7 +139,7 @@ class Control:
             # Two periods between two lines would look like a jump.
             assert before is None or int(words[0]) == before + 1, f"the sampler lost periods: {before} to {words[0]}"
             before = int(words[0])
-            found.append(Period(*(1000.0 * float(w) for w in words[1:5]), on=words[5] == "1"))
+            found.append(self._read(words[1:]))
 
 
 def changed(text: str, changes: dict[str, str]) -> str:
@@ -163,8 +169,16 @@ NAMESPACES = ("unshare", "--ipc", "--pid", "--mount", "--mount-proc", "--net", "
 
 
 @contextmanager
-def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Iterator[tuple[Control, Path]]:
-    """Start the shipped configuration with other settings.
+def linuxcnc(
+    folder: Path,
+    settings: str,
+    *,
+    hal: str = "",
+    sampler: str = SAMPLER,
+    read: Callable[[list[str]], Any] = period,
+    **ini: str,
+) -> Iterator[tuple[Control, Path]]:
+    """Start the shipped configuration with other settings, and with a sampler whose lines `read` understands.
 
     Yields
     ------
@@ -176,7 +190,9 @@ def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Itera
     for name in (
         "machine.hal",
         "thermal.hal",
+        "thermal_axes.hal",
         "thermal_offset.py",
+        "thermal_axis.py",
         "reconcile.py",
         "thermal_probe.ngc",
         "thermal_probe.hal",
@@ -196,7 +212,7 @@ def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Itera
     )
     (folder / "machine.ini").write_text(text, encoding="utf-8")
     (folder / "thermal.toml").write_text(settings, encoding="utf-8")
-    (folder / "sampler.hal").write_text(SAMPLER + hal, encoding="utf-8")
+    (folder / "sampler.hal").write_text(sampler + hal, encoding="utf-8")
     # The system's Python with this environment's zenoh, whose wheel is for every version of Python 3.
     python = folder / "python"
     packages = Path(zenoh.__file__).parents[1]
@@ -223,7 +239,7 @@ def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Itera
             stdout=out,
             stderr=subprocess.STDOUT,
         )
-        control = Control(folder, path)
+        control = Control(folder, path, read)
         try:
             control.connect(lambda: process.poll() is None)
             control.sample()

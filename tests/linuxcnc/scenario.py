@@ -25,6 +25,7 @@ import zenoh
 from compensator.demo.machine import configuration, hardware
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.linuxcnc.control import SHIPPED, Control, Period, changed, linuxcnc
+from tests.linuxcnc.several import axes
 from tests.receiver.wire import ScriptedService, router, until
 
 PORT = 7447
@@ -503,5 +504,7 @@ def refused(folder: Path) -> None:
 if __name__ == "__main__":  # NAME FOLDER
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     place = Path(sys.argv[2])
-    {"scripted": scripted, "service": service, "probing": probing, "refused": refused}[sys.argv[1]](place / "control")
+    {"scripted": scripted, "service": service, "probing": probing, "refused": refused, "axes": axes}[sys.argv[1]](
+        place / "control"
+    )
     print("done", flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -57,12 +58,9 @@ def rms(values: np.ndarray) -> float:
     ("lag_min", "delay_min", "without_um", "most_um", "most_inverse_um"),
     [
         (1.0, 0.0, 0.9, 0.32, 0.36),
-        (3.0, 0.0, 2.5, 0.40, 0.55),
         (6.0, 0.0, 4.7, 0.49, 0.90),
         (0.0, 0.5, 0.5, 0.31, 0.34),
-        (0.0, 2.0, 1.8, 0.36, 0.36),
         (0.0, 2.6, 2.3, 0.47, 0.50),
-        (0.0, 3.0, 2.6, 0.62, 0.62),
         (0.0, 4.0, 3.5, 0.95, 0.95),
         (3.0, 2.0, 4.2, 0.80, 1.15),
     ],
@@ -83,15 +81,22 @@ def test_what_is_left(
         assert rms(np.array(after)) < most, method
 
 
-@pytest.mark.parametrize(("lag_min", "delay_min"), [(6.0, 0.0), (0.0, 2.0), (0.0, 3.5), (2.0, 3.0)])
+@functools.cache
+def prompt_week() -> tuple[float, float]:
+    """The model's own error in a week with a T_Q that is not late, and the deviation that follows from it, µm."""
+    t_q, at, y = run_of(30, 168.0, 0.03, form="sensor", lag_min=0.0, delay_min=0.0)
+    y_pred, std = predicted(dataclasses.replace(QUILL, y_std_um=0.0), t_q, at)
+    own_um = float(np.sqrt(max(rms(y_pred - y) ** 2 - rms(std) ** 2, 0.0)))
+    return own_um, rms(np.hypot(std, own_um))
+
+
+@pytest.mark.parametrize(("lag_min", "delay_min"), [(6.0, 0.0), (0.0, 3.5), (2.0, 3.0)])
 def test_the_stated_deviation_is_that_of_a_week(lag_min: float, delay_min: float) -> None:
     """The model's own error is what it leaves in another week with a T_Q that is not late."""
-    base = dataclasses.replace(QUILL, y_std_um=0.0)
-    t_q, at, y = run_of(30, 168.0, 0.03, form="sensor", lag_min=0.0, delay_min=0.0)
-    y_pred, std = predicted(base, t_q, at)
-    own_um = float(np.sqrt(max(rms(y_pred - y) ** 2 - rms(std) ** 2, 0.0)))
-    prompt_um = rms(np.hypot(std, own_um))
-    model = dataclasses.replace(late(base, lag_min=lag_min, delay_min=delay_min), y_std_um=own_um)
+    own_um, prompt_um = prompt_week()
+    model = dataclasses.replace(
+        late(dataclasses.replace(QUILL, y_std_um=0.0), lag_min=lag_min, delay_min=delay_min), y_std_um=own_um
+    )
     t_q, at, y = run_of(31, 168.0, 0.03, form="sensor", lag_min=lag_min, delay_min=delay_min)
     y_pred, std = predicted(model, t_q, at)
     assert 0.7 < rms(y_pred - y) / rms(std) < 1.4

@@ -95,6 +95,16 @@ def test_degraded_is_followed_and_said() -> None:
     assert last.offset_um == 3.5 and codes(last) == {"service_degraded"} and "predicting" in last.text
 
 
+def test_a_receiver_of_y_alone_says_what_else_the_service_publishes() -> None:
+    f, t = settled(3.0)
+    f.receive(t, offset(3, 3.5, axis="y", axes=["x", "y", "a"], y_slope_um_per_m=4.0, reference_mm=0.0))
+    last = run(f, t, 30.0)[-1]
+    assert last.offset_um == 3.5 and codes(last) == {"further_axes", "slope_not_applied"} and "x, a" in last.text
+    for seq, axes in enumerate((["y"], "xz", {"x": 1}, [["x"]], ["\ud800"], ["x"] * 9), 4):
+        assert f.receive(t, offset(seq, 3.5, axes=axes, y_slope_um_per_m=None))
+        assert not f.advance(t + 40.0).reasons
+
+
 def test_a_new_service_with_another_offset_is_walked_to() -> None:
     f, t = settled(3.0)
     f.alive = False

@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from tests.receiver.offsets import offset
+from tests.receiver.offsets import axis_offset, offset
 
 PREFIX = "shop/vmc-07"
 
@@ -64,6 +64,9 @@ class ScriptedService:
         self.probes: list[dict[str, Any]] = []
         self.probe_answer: dict[str, Any] = {"ok": True, "text": "heard", "code": ""}
         self._commands = self.session.declare_queryable(f"{prefix}/thermal/command/probe/*", self._answer_probe)
+        self._axes: dict[str, Any] = {}
+        self._answered: list[Any] = []
+        self._lengths: Any = None
         self._token = self.session.liveliness().declare_token(f"{prefix}/thermal/alive")
 
     def _answer(self, query: Any) -> None:
@@ -77,6 +80,47 @@ class ScriptedService:
             until(lambda: self._publisher.matching_status.matching, "a subscriber")
         self.latest = offset(seq, y_um, **{"time_utc_ns": time.time_ns(), **changes})
         self._publisher.put(self.latest)
+
+    def put_axes(self, seq: int, *, heard: bool = True, without: str = "", **values: Any) -> None:
+        """Publish a sample of several axes, each a value or the arguments of its message; `without` some of them."""
+        time_utc_ns = time.time_ns()
+        for axis in values:
+            if axis not in self._axes:
+                key = self.key.replace("/y/", f"/{axis}/")
+                self._axes[axis] = [key, self.session.declare_publisher(key), b""]
+                if axis != "y":
+                    self._answered.append(self.session.declare_queryable(key, self._answers_of(axis)))
+        for axis, value in values.items():
+            changes = {"time_utc_ns": time_utc_ns, **(value if isinstance(value, dict) else {"value": value})}
+            number = changes.pop("value", 0.0)
+            payload = axis_offset(axis, seq, number, **{"axes": "".join(values), **changes})
+            key, publisher, _ = self._axes[axis]
+            if heard:
+                until(lambda p=publisher: p.matching_status.matching, "a subscriber")
+            if axis in without:
+                continue
+            self._axes[axis][2] = payload
+            if axis == "y":
+                self.latest = payload
+            publisher.put(payload)
+
+    def _answers_of(self, axis: str) -> Callable[[Any], None]:
+        def answer(query: Any) -> None:
+            key, _, payload = self._axes[axis]
+            with query:
+                if payload:
+                    query.reply(key, payload)
+
+        return answer
+
+    def put_length(self, tool_length_mm: float | None, **changes: Any) -> None:
+        """Publish the length of the tool."""
+        key = self.key.replace("y/offset", "tool_length")
+        if self._lengths is None:
+            self._lengths = self.session.declare_publisher(key)
+        until(lambda: self._lengths.matching_status.matching, "a subscriber")
+        own = {"schema": 1, "machine": "vmc-07", "time_utc_ns": time.time_ns(), "valid_for_s": 600.0}
+        self._lengths.put(json.dumps({**own, "tool_length_mm": tool_length_mm, **changes}))
 
     def _answer_status(self, query: Any) -> None:
         with query:
@@ -97,6 +141,9 @@ class ScriptedService:
         self._statuses.put(self.status)
 
     def close(self) -> None:
+        own = [*self._answered, *(publisher for _, publisher, _ in self._axes.values())]
+        for one in [*own, *([] if self._lengths is None else [self._lengths])]:
+            one.undeclare()
         self._commands.undeclare()
         self._statuses.undeclare()
         self._status_queryable.undeclare()

@@ -56,6 +56,9 @@ name = "old"
 [[probe]]
 name = "probe-07"
 machines = ["vmc-07"]
+[[tool]]
+name = "tool-07"
+machines = ["vmc-07"]
 """
 
 
@@ -103,6 +106,8 @@ def make_keys(folder: Path) -> Path:
         "bert",
         "--probe",
         "probe-07",
+        "--tool",
+        "tool-07",
     )
     script("certificates.py", str(keys), "--operator", "old", "--days", "-2")
     script("certificates.py", str(folder / "other"), "--operator", "anna", "--receiver", "cnc-07")

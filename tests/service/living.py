@@ -35,8 +35,8 @@ from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 
 MACHINE = "vmc-07"
-#: Real seconds that a poll takes at least while the service works on a command.
-PATIENCE_S = 0.01
+#: Real seconds that a sample takes at least while the service works on a command.
+PATIENCE_S = 0.02
 
 
 def settings(**changes: Any) -> Config:
@@ -47,7 +47,9 @@ def settings(**changes: Any) -> Config:
 class Machine:
     """A machine without sensor noise, so that two runs of it measure the same."""
 
-    def __init__(self, folder: Path, conf: Config | None = None, model: bytes | None = None) -> None:
+    def __init__(
+        self, folder: Path, conf: Config | None = None, model: bytes | None = None, *, start_ns: int = START_NS
+    ) -> None:
         self.folder = folder
         self.config = conf or settings()
         self.config_bytes = b"the configuration"
@@ -67,13 +69,14 @@ class Machine:
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
+            patience_s = PATIENCE_S * self.config.sampling.poll_interval_s / 60.0
             self.promised = [promise for promise in self.promised if not promise.done()]
             if self.promised:
-                await asyncio.sleep(PATIENCE_S)
+                await asyncio.sleep(patience_s)
             while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
-                await asyncio.sleep(PATIENCE_S)
+                await asyncio.sleep(patience_s)
 
-        self.clock = VirtualClock(START_NS, advance)
+        self.clock = VirtualClock(start_ns, advance)
 
     @property
     def recordings(self) -> Path:

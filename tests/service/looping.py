@@ -12,7 +12,7 @@ import numpy as np
 from compensator.config import Config
 from compensator.events import Note
 from compensator.messages import Sample
-from compensator.model.effects import effect_from
+from compensator.model.effects import Effect, effect_from
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
@@ -40,6 +40,15 @@ def extended(gain: float = 3.0, std: float = 0.05, *, tau_min: float = 60.0) -> 
     """The published model with the effect of the coolant."""
     table = {"channel": "coolant_degc", "curve": "linear", "tau_min": [tau_min], "gain": [gain], "delay_min": 5.0}
     effect = dataclasses.replace(effect_from("input", table), std={"gain": [std], "tau_min": [1.0]})
+    return _with(effect)
+
+
+def stronger(change: float) -> bytes:
+    """The published model with another gain, which the machine does not have."""
+    return _with(effect_from("gain", {"path": "DTF", "change": change}))
+
+
+def _with(effect: Effect) -> bytes:
     model = parse_model(QUILL_FILE, source="test")
     return dump_model(dataclasses.replace(model, effects=(effect,), provenance={})).encode()
 

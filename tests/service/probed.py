@@ -26,7 +26,7 @@ tolerance_um = 3.0
 #: The configuration of `tests.audit.made`, without the sensor of Y.
 SENSOR = CONFIG.index(b'[[channel]]\nname = "y_um"')
 COOLANT = CONFIG.index(b'[[channel]]\nname = "coolant_degc"')
-PROBED = (CONFIG[:SENSOR] + CONFIG[COOLANT:] + PROBE).replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
+PROBED = (CONFIG[:SENSOR] + CONFIG[COOLANT:] + PROBE).replace(b"poll_interval_s = 10.0", b"poll_interval_s = 60.0")
 RATE_UM = 8.0
 
 

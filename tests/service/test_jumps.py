@@ -101,6 +101,24 @@ def test_a_jump_is_never_ok_and_its_mend_makes_the_offset_right_at_once(
     assert np.max(np.abs(np.diff(offsets(outcomes)))) <= 20.0 + 1e-9
 
 
+@pytest.mark.parametrize("size", [8.0, -8.0])
+def test_a_jump_that_takes_three_samples_is_one_jump(day: dict[str, np.ndarray], size: float) -> None:
+    """Each step is within the permitted rate; less the first step alone, the rest would be heat."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if BEGIN <= i < END:
+            values["t_q_degc"] += size * min((i - BEGIN + 1) / 3.0, 1.0)
+
+    outcomes = run(day, change)
+    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    # Noticed in the sample after its end.
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 3 : END])
+    assert {round(data["shift_k"]) for o in outcomes for _, _, data in o.notes if data.get("code") == "jumped"} == {
+        size
+    }
+    assert not np.any(wrong[END + 12 :]) and outcomes[-1].offset.state == "ok"
+
+
 def hidden(change: Change, channel: str, gap: int) -> Change:
     """The couple is open until the jump: what it shows then could also be heat, or the air, that has changed."""
 

@@ -99,7 +99,7 @@ class WarmAtFirst(Looping):
 @pytest.fixture(scope="module")
 def adopted(tmp_path_factory):
     """A service in which a person has adopted a candidate whose level contradicts measured Y."""
-    service = WarmAtFirst(tmp_path_factory.mktemp("level"), shown(extended()), acts=begun)
+    service = WarmAtFirst(tmp_path_factory.mktemp("level"), shown(extended()), acts=begun, before_night=20 * 60)
 
     async def adopts():
         await service.run(2400, until=in_phase(service, "proposed"))

@@ -51,7 +51,7 @@ def _fields(channel):
 
 
 async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(tmp_path: Path) -> None:
-    service = Looping(tmp_path, shown(None, "adequate"))
+    service = Looping(tmp_path, shown(None, "adequate"), before_night=20 * 60)
     zero = service.at_sample[120] = Asked(service, "zero", mode="warm")
     await service.run(300)
     assert zero.answer["ok"], zero.answer

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.service.loop.run import LoopRun
 from compensator.service.transfer.comparison import SURE_PART
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
-from tests.service.test_loop_watch import watching
+from tests.service.test_loop_watch import HOUR_NS, follows, watching
 from tests.service.test_restart import QUILL
 
 SHORT = {"loop": {"policy": "adopt", "every_h": 8, "at_utc": "02:00", "shadow_h": 6.0}}
@@ -68,10 +68,13 @@ def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None
 
 
 def test_a_candidate_gives_its_place_to_other_effects_of_a_later_diagnosis_at_once() -> None:
-    leading = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
-    loop, now_ns = watching(3.0, leading, role="candidate")
-    found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
-    (note,) = loop.receive(found, now_ns)
-    assert note.data["step"] == "shadow"
-    loop.shadow_begins("b" * 64, found.effects, now_ns)
-    assert loop.state.verdict.verdict == "not_judged"  # what other effects have shown does not count for it
+    loop, now_ns = watching(ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED))
+    running = loop.state.diagnosis
+    loop.shadow_begins("c" * 64, ["delay:DTF"], now_ns - HOUR_NS)
+    loop.state.diagnosis = running
+    assert loop.state.found is not None
+    loop.state.found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
+    assert follows(loop, now_ns) == ("shadow", "")
+    loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
+    # What other effects have shown does not count for it.
+    assert loop.state.found.sha256 == "b" * 64 and loop.state.found.verdict.verdict == "not_judged"

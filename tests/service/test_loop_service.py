@@ -18,6 +18,7 @@ import pytest
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit
+from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.messages import Candidate
 from compensator.recording.container import Container
@@ -33,6 +34,7 @@ from compensator.service.transfer.model_store import sha256_of
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE, Machine, largest_step
 from tests.service.looping import extended, shown
+from tests.service.simulated import START_NS
 from tests.service.test_restart import QUILL
 
 LOOP = b"""
@@ -43,15 +45,25 @@ shadow_h = 6.0
 """
 
 
+#: The service starts so long before the night's diagnosis, samples; none of these needs a whole day before it.
+EVENING = 6 * 60
+
+
 class Looping(Machine):
     """A machine whose coolant acts on Y, with a loop whose diagnosis is told what it finds."""
 
     def __init__(
-        self, folder: Path, *found: Diagnosed, policy: str = "adopt", acts: Callable[[int], float] = lambda i: 1.0
+        self,
+        folder: Path,
+        *found: Diagnosed,
+        policy: str = "adopt",
+        acts: Callable[[int], float] = lambda i: 1.0,
+        before_night: int = EVENING,
     ) -> None:
         data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
         data += LOOP.replace(b"POLICY", policy.encode())
-        super().__init__(folder, parse_config(data, source="test"))
+        start_ns = START_NS + (20 * 60 - before_night) * 60 * NS
+        super().__init__(folder, parse_config(data, source="test"), start_ns=start_ns)
         self.config_bytes, self.acts, self.found = data, acts, list(found)
         self.asked: list[StartDiagnosis] = []
         self.state_um = 0.0
@@ -110,7 +122,7 @@ def checked(machine: Looping) -> None:
 
 async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is_replayed(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     await machine.run(60)
     steps = machine.steps()
     assert steps == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
@@ -124,8 +136,8 @@ async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is
     assert not any(name == "candidate" for name, _ in machine.published)
     files = recordings(machine.recordings, MACHINE)
     openings = [opening_of(path) for path in files]
-    models = [(opening["model.toml"], opening.get("candidate.toml")) for opening in openings]
-    assert list(dict.fromkeys(models)) == [(QUILL, None), (QUILL, extended()), (extended(), QUILL)]
+    models = [tuple(map(opening.get, ("model.toml", "candidate.toml", "before.toml"))) for opening in openings]
+    assert list(dict.fromkeys(models)) == [(QUILL, None, None), (QUILL, extended(), None), (extended(), None, QUILL)]
     event = machine.events("adopt")[-1]
     assert event.data["by"] == "loop" and event.data["comparison"]["verdict"] == "better"
     # A replay sees what was changed afterwards: a record of the shadow, and a decision that was made up or left out.
@@ -185,8 +197,8 @@ def in_phase(machine: Looping, phase: str, then: Callable[[], None] = lambda: No
 
 async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()), policy="propose")
-    early = machine.at_sample[1260] = Asked(machine, "adopt", candidate=True)
-    await machine.run(1800, until=in_phase(machine, "proposed"))
+    early = machine.at_sample[420] = Asked(machine, "adopt", candidate=True)
+    await machine.run(960, until=in_phase(machine, "proposed"))
     assert not early.answer["ok"] and "not proposed yet" in early.answer["text"]
     assert machine.store.in_use() == QUILL and machine.steps()[-1] == ("propose", "")
     yes = machine.at_sample[len(machine.outcomes) + 30] = Asked(machine, "adopt", candidate=True)
@@ -199,8 +211,8 @@ async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_p
 
 async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    no = machine.at_sample[1260] = Asked(machine, "dismiss")
-    await machine.run(1440 + 1260)
+    no = machine.at_sample[420] = Asked(machine, "dismiss")
+    await machine.run(1440 + 420)
     assert no.answer["ok"], no.answer
     again = machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "dismiss")
     await machine.run(20)
@@ -218,8 +230,8 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
     machine = Looping(tmp_path, shown(extended()))
     other = extended(2.9)
     adopt = Asked(machine, "adopt", model=other.decode(), sha256=sha256_of(other))
-    machine.at_sample[1300] = adopt
-    await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(other))
+    machine.at_sample[460] = adopt
+    await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(other))
     assert adopt.answer["ok"], adopt.answer
     await machine.run(30)
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "by_hand")]
@@ -230,16 +242,16 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
 
 async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path) -> None:
     machine = Looping(tmp_path / "killed", shown(extended()))
-    await machine.run(1250)
+    await machine.run(410)
     await machine.run_and_kill(100)
     await machine.run(600, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     always = Looping(tmp_path / "always", shown(extended()))
-    await always.run(1950, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await always.run(1110, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     assert machine.steps() == always.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
     ends = [one.outcomes[-1].sample.time_utc_ns for one in (machine, always)]
     # The pauses cost samples, and the comparison the block that they are in.
     assert abs(ends[0] - ends[1]) <= 3600e9
-    assert {one.seq for one in machine.candidates()} >= {o.sample.seq for o in machine.outcomes[1260:1340]}
+    assert {one.seq for one in machine.candidates()} >= {o.sample.seq for o in machine.outcomes[420:500]}
     checked(machine)
 
 
@@ -253,7 +265,7 @@ async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made
         raise AssertionError
 
     answers, machine.diagnose = machine.diagnose, hanging  # type: ignore[method-assign]
-    await machine.run_and_kill(1250)
+    await machine.run_and_kill(410)
     assert len(machine.asked) == 1 and machine.steps() == [("diagnose", "planned")]
     machine.diagnose, machine.waits_for_diagnoses = answers, True  # type: ignore[method-assign]
     await machine.run(100)
@@ -272,7 +284,7 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
         raise AssertionError
 
     machine.diagnose = hanging  # type: ignore[method-assign]
-    await machine.run(1250)
+    await machine.run(410)
     for _ in range(3):
         await machine.run(10)
     assert len(machine.asked) == 2
@@ -292,7 +304,7 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
             machine.daemon.stop()
 
     machine.at_poll = stored
-    await machine.run(1800)
+    await machine.run(960)
     machine.at_poll = lambda: None
     last = machine.outcomes[-1]
     assert last.offset.model_sha256 == sha256_of(QUILL)
@@ -319,7 +331,7 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(model_store, "replace_file", full)
-    await machine.run(1800, until=lambda _: bool(refused))
+    await machine.run(960, until=lambda _: bool(refused))
     monkeypatch.setattr(model_store, "replace_file", works)
     await machine.run(30)
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", ""), ("end", "failed")]
@@ -333,7 +345,7 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
 
 async def test_another_policy_ends_the_shadow_at_the_restart_and_holds_from_then_on(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    await machine.run(1500)
+    await machine.run(660)
     assert machine.steps()[-1] == ("shadow", "")
     machine.use(machine.config_bytes.replace(b'policy = "adopt"', b'policy = "propose"'))
     await machine.run(5)
@@ -355,26 +367,26 @@ async def test_a_defect_of_the_shadow_ends_the_shadow_and_never_a_sample(
     works = Shadow.process
 
     def breaks(shadow: Shadow, outcome: Outcome) -> Any:
-        if len(machine.outcomes) == 1300:
+        if len(machine.outcomes) == 460:
             raise ZeroDivisionError("a defect")
         return works(shadow, outcome)
 
     monkeypatch.setattr(Shadow, "process", breaks)
-    await machine.run(1320)
+    await machine.run(480)
     monkeypatch.setattr(Shadow, "process", works)
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "failed")]
-    states = {outcome.offset.state for outcome in machine.outcomes[1290:]}
-    assert states == {"ok"} and len(machine.outcomes) == 1320
+    states = {outcome.offset.state for outcome in machine.outcomes[450:]}
+    assert states == {"ok"} and len(machine.outcomes) == 480
     assert "a defect" in machine.events("loop")[-1].text
     checked(machine)
 
 
 async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp_path: Path) -> None:
-    machine = Looping(tmp_path)
+    machine = Looping(tmp_path, before_night=600)
     machine.diagnose = DiagnosisProcess(  # type: ignore[method-assign]
         machine.config, machine.recordings, machine.store.folder / "diagnoses"
     )
-    await machine.run(1250, until=in_phase(machine, "shadow"))
+    await machine.run(650, until=in_phase(machine, "shadow"))
     assert machine.steps() == [("diagnose", "planned"), ("shadow", "")]
     found = machine.events("diagnosis")[-1].data
     assert found["verdict"] == "explained" and found["effects"] == ["input:coolant_degc"]

@@ -1,29 +1,44 @@
-"""The model before an adoption: how long it keeps its place beside the adopted one."""
+"""The model before an adoption: it is compared beside whatever a diagnosis finds meanwhile."""
 
 from __future__ import annotations
 
+import asyncio
+import errno
+import itertools
+import json
 import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from unittest.mock import Mock
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.messages import Sample
+from compensator.model.model_file import parse_model
 from compensator.recording.reading import recordings
+from compensator.service.compensation import Compensation
 from compensator.service.loop import live
+from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.run import LoopRun
-from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Compared, LoopState, Running
+from compensator.service.loop.one_place import use_both
+from compensator.service.loop.run import LoopRun, LoopStep
+from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.state import LoopState, Place, Running, decode_loop
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
-from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer import model_store
+from compensator.service.transfer.model_store import ModelStore, sha256_of
+from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.service.living import MACHINE
-from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
-from tests.service.test_loop_service import Asked, Looping, checked, in_phase
+from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
+from tests.service.test_loop_run import CHECKED
+from tests.service.test_loop_service import Asked, Looping, checked, in_phase, replayed
 from tests.service.test_restart import QUILL
 
 HOUR_NS = 3600 * NS
@@ -31,45 +46,113 @@ ADOPTED_NS = 1_000_000 * HOUR_NS
 NOT_JUDGED, ALIKE, WORSE = ComparisonVerdict.NOT_JUDGED, ComparisonVerdict.ALIKE, ComparisonVerdict.WORSE
 
 
-def test_other_parameters_found_meanwhile_do_not_stop_the_way_back() -> None:
-    """The effect ends at the adoption, and each diagnosis finds it smaller."""
-    tables = {"loop": {"policy": "adopt", "shadow_h": 6.0, "every_h": 4}}
-    night, ended = Night(shown(extended())), list[int]()
-    loop = LoopRun(settings(**tables), QUILL, night)
-    source = machine(2 * DAY, acts=lambda i: float(not ended))
+SIX_HOURS = {"loop": {"policy": "adopt", "shadow_h": 6.0, "every_h": 4}}
+
+
+def adopted(
+    night: Night, acts: Callable[[int], float], tables: Mapping[str, Any] = SIX_HOURS, **changes: Any
+) -> tuple[LoopRun, Iterator[Sample]]:
+    """Run a machine until the first candidate is adopted; return the loop and the samples after it."""
+    loop, source = LoopRun(settings(**tables), QUILL, night), machine(4 * DAY, acts, **changes)
     for one in source:
         loop.process(one)
         if loop.phase == "watching":
-            break
-    ended.append(one.seq)
-    night.found = [shown(extended(2.0))]
-    steps = run(loop, source)
+            return loop, source
+    raise AssertionError
+
+
+@pytest.mark.parametrize("change", [0.1, -0.1])
+def test_the_way_back_stays_open_whatever_is_found_meanwhile(change: float) -> None:
+    """The effect ends at the adoption, and each diagnosis finds another gain, which is not there."""
+    night, ended = Night(shown(extended())), list[int]()
+    loop, source = adopted(night, lambda i: float(not ended))
+    steps = run(loop, source, 1)
+    ended.append(steps[0].outcome.sample.seq)
+    night.found = [shown(stronger(change))]
+    steps += run(loop, source, DAY)
     found = decisions(steps)
     back = next(seq for seq, step, _ in found if step == "back")
-    assert {decision[1:] for decision in found if decision[0] < back} == {("diagnose", "planned"), ("nothing", "waits")}
-    candidates = [step.candidate for step in steps if step.candidate and step.outcome.sample.seq <= back]
-    assert {one.role for one in candidates} == {"before"} and back - ended[0] < DAY // 2
+    roles = [{one.role for one in step.candidates} for step in steps if step.outcome.sample.seq == back]
+    assert roles == [{"before", "candidate"}] and back - ended[0] < DAY // 2
+    assert [step for seq, step, _ in found if seq < back].count("shadow") >= 1
+    assert loop.effects == () and "adopt" not in [step for _, step, _ in found]
+    # What was found goes on beside the model that is in force now, and what it has shown begins anew.
+    after = [one for step in steps if step.outcome.sample.seq == back + 1 for one in step.candidates]
+    assert [(one.role, one.hours, one.verdict) for one in after] == [("candidate", 0.0, "not_judged")]
+
+
+def test_other_parameters_are_adopted_and_the_model_before_both_stays_the_way_back() -> None:
+    """The first candidate has a third of the effect; then the whole of it is adopted, then the effect ends."""
+    night, ended = Night(shown(extended(1.0))), list[int]()
+    loop, source = adopted(night, lambda i: float(not ended))
+    night.found = [shown(extended())]
+    loop._core.state.adopted_utc_ns -= 24 * HOUR_NS  # no day between two adoptions
+    steps = list[LoopStep]()
+    for one in source:
+        steps.append(loop.process(one))
+        if steps[-1].model_sha256 == sha256_of(extended()):
+            break
+    first, second = [seq for seq, step, _ in decisions(steps) if step in ("shadow", "adopt")][:2]
+    assert second - first >= 6 * 60 - 1
+    beside = {one.model_sha256 for one in run(loop, source, 1)[0].candidates}
+    assert beside == {sha256_of(QUILL), sha256_of(extended(1.0))}
+    ended.append(one.seq)
+    steps = run(loop, source, DAY)
+    assert loop.effects == () and steps[-1].model_sha256 == sha256_of(QUILL)
+    assert [step for _, step, _ in decisions(steps) if step in ("adopt", "back")] == ["back"]
+
+
+def test_a_couple_that_drifts_while_both_are_compared_judges_neither_and_changes_no_model() -> None:
+    night, began = Night(shown(extended())), list[int]()
+
+    def drifting(i: int, values: dict[str, float]) -> None:
+        if began:
+            values["t_q_degc"] += 0.01 * (i - began[0])
+
+    loop, source = adopted(night, lambda i: 1.0, SIX_HOURS | CHECKED, change=drifting)
+    night.found = [shown(stronger(0.1))]
+    while len(run(loop, source, 1)[0].candidates) < 2:
+        pass
+    loop._core.state.adopted_utc_ns -= 24 * HOUR_NS  # an adoption would be permitted
+    steps = run(loop, source, 90)
+    began.append(steps[-1].outcome.sample.seq)
+    steps += run(loop, source, 500)
+    assert any(sensor_suspected(step.outcome.offset.reasons) for step in steps)
+    for role in ("before", "candidate"):
+        hours = [one.hours for step in steps for one in step.candidates if one.role == role]
+        assert max(hours) > 0.0 == hours[-1]  # what was compared until it was suspected is forgotten
+    assert not {"adopt", "back"} & {step for _, step, _ in decisions(steps)}
+    assert loop.effects == ("input:coolant_degc",)
+
+
+def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
+    night = Night(shown(extended()))
+    loop, source = adopted(night, lambda i: 1.0)
+    night.found = [shown(stronger(0.1))]
+    while len(run(loop, source, 1)[0].candidates) < 2:
+        pass
+    run(loop, source, 45)
+    resumed = LoopRun(settings(**SIX_HOURS), QUILL, night)
+    resumed.restore(loop.state())
+    source, again = itertools.tee(source)
+    for a, b in zip(run(loop, source, 60), run(resumed, again, 60), strict=True):
+        assert (a.outcome.offset, a.candidates, a.events) == (b.outcome.offset, b.candidates, b.events)
+    assert len(a.candidates) == 2
 
 
 def watching(
-    hours: float,
-    verdict: ComparisonData,
-    misfit_h: float = 0.0,
-    *,
-    since_h: float = 0.0,
-    role: Role = "before",
+    verdict: ComparisonData, *, places: Literal[1, 2] = 2, hours: float = 30.0, misfit_h: float = 0.0
 ) -> tuple[Loop, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
-    since_ns = ADOPTED_NS + round(since_h * HOUR_NS)
-    now_ns = since_ns + round(hours * HOUR_NS)
+    now_ns = ADOPTED_NS + round(hours * HOUR_NS)
+    before = Place(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
     state = LoopState(
-        phase="watching" if role == "before" else "shadow",
-        shadow=Compared(sha256="a" * 64, effects=[], role=role, since_utc_ns=since_ns),
+        places=places,
         adopted_utc_ns=ADOPTED_NS,
         misfit_min=60.0 * misfit_h,
-        verdict=verdict,
         diagnosis=Running(from_utc_ns=ADOPTED_NS, to_utc_ns=now_ns, why="planned"),
     )
+    state.put("watched" if places == 2 else "found", before)
     return Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
 
 
@@ -81,8 +164,26 @@ def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
     return note.data["step"], note.data.get("why", "")
 
 
+def test_the_model_that_is_watched_does_not_run_twice() -> None:
+    loop, now_ns = watching(judged(NOT_JUDGED))
+    found = DiagnosisData(verdict="explained", effects=["gain:TDTF"], candidate_sha256="a" * 64, in_shadow=True)
+    (note,) = loop.receive(found, now_ns)
+    assert (note.data["step"], note.data["why"]) == ("nothing", "in_shadow")
+
+
 def judged(verdict: ComparisonVerdict, deviations: float | None = None, ratio: float | None = None) -> ComparisonData:
     return ComparisonData(verdict=verdict, deviations=deviations, ratio=ratio)
+
+
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("verdict", [judged(NOT_JUDGED), judged(ALIKE, 2.5, 0.8), judged(WORSE, -9.0, 3.0)])
+def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData, *, same: bool) -> None:
+    loop, now_ns = watching(verdict, hours=1.0)
+    assert follows(loop, now_ns, same=same) == ("shadow", "")
+    loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
+    assert {name: place.sha256[0] for name, place in loop.state.taken.items()} == {"watched": "a", "found": "b"}
+    assert loop.state.watched is not None and loop.state.watched.verdict == verdict
+    assert loop.state.phase == "shadow"
 
 
 @pytest.mark.parametrize(
@@ -90,54 +191,132 @@ def judged(verdict: ComparisonVerdict, deviations: float | None = None, ratio: f
     [
         (100.0, judged(NOT_JUDGED), 0.0, True, True),
         (100.0, judged(ALIKE, 0.5, 1.0), 0.0, False, True),
-        (100.0, judged(ALIKE, 2.5, 0.8), 0.0, True, True),
         (23.9, judged(WORSE, -9.0, 3.0), 0.0, True, True),
-        (24.0, judged(WORSE, -9.0, 3.0), 0.0, False, False),
         (10.0, judged(WORSE, -9.0, 3.0), 3.0, False, False),
-        (10.0, judged(NOT_JUDGED), 3.0, True, True),
-        (10.0, judged(ALIKE, 0.5, 1.0), 3.0, False, False),
-        (10.0, judged(ALIKE, 0.5, 1.0), 2.9, True, True),
         (10.0, judged(ALIKE, 2.5, 0.8), 3.0, True, True),
     ],
 )
-def test_a_candidate_waits_until_the_model_before_is_not_better_and_something_else_is_needed(
+def test_in_a_recording_with_one_place_a_candidate_waited(
     hours: float, verdict: ComparisonData, misfit_h: float, *, other_waits: bool, same_waits: bool
 ) -> None:
     for same, waits in ((False, other_waits), (True, same_waits)):
-        loop, now_ns = watching(hours, verdict, misfit_h)
+        loop, now_ns = watching(verdict, places=1, hours=hours, misfit_h=misfit_h)
         assert follows(loop, now_ns, same=same) == (("nothing", "waits") if waits else ("shadow", ""))
-        assert (loop.state.diagnosis is None) == waits
-        assert loop.state.shadow is not None and loop.state.shadow.sha256 == "a" * 64
+        assert loop.state.found is not None and loop.state.found.sha256 == "a" * 64
 
 
-def test_the_calibrated_model_that_a_diagnosis_has_brought_gives_way_to_a_candidate() -> None:
-    assert follows(*watching(1.0, judged(NOT_JUDGED), since_h=50.0)) == ("shadow", "")
+def of_version_1(state: LoopState) -> bytes:
+    """Return a state with one place as version 1 wrote it."""
+    table = msgspec.to_builtins(state)
+    found = table.pop("found")
+    for name in ("places", "watched", "incoming"):
+        del table[name]
+    parts = {name: found.pop(name) for name in ("comparison", "verdict", "error", "is_proposed")}
+    phase = "proposed" if parts["is_proposed"] else "shadow" if found["role"] == "candidate" else "watching"
+    table |= {"schema": 1, "phase": phase, "shadow": found, "other_error": parts["error"]}
+    table |= {"comparison": parts["comparison"], "verdict": parts["verdict"]}
+    return msgspec.json.encode(table)
+
+
+def test_a_state_of_version_1_is_read_decides_as_it_did_and_goes_on_with_two_places() -> None:
+    loop, now_ns = watching(judged(NOT_JUDGED), places=1)
+    assert loop.state.found is not None
+    loop.state.found.error.blocks = [(7, 1.5)]
+    read = decode_loop(of_version_1(loop.state))
+    assert msgspec.json.encode(read) == msgspec.json.encode(loop.state)
+    again = Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], read)
+    assert follows(again, now_ns) == ("nothing", "waits")
+    use_both(read)
+    assert read.found is None and read.watched is not None and read.watched.error.blocks == [(7, 1.5)]
+    read.diagnosis = loop.state.diagnosis
+    assert follows(again, now_ns) == ("shadow", "")
+
+
+def test_a_service_goes_on_with_two_places_after_a_recording_with_one() -> None:
+    config = settings()
+    present = parse_model(extended(), source="present")
+    before = Compensation(config, parse_model(QUILL, source="before"))
+    before.begin(None)
+    state = watching(judged(NOT_JUDGED), places=1)[0].state
+    assert state.found is not None
+    state.found.sha256 = sha256_of(QUILL)
+    opening = {"loop.json": of_version_1(state), "candidate.toml": QUILL, "candidate_state.json": before.state()}
+    core = ModelLoop(config, present, opening)
+    assert core.attachments().keys() == opening.keys()
+    core.use_both_places()
+    moved = core.attachments()
+    assert moved.keys() == {"loop.json", "before.toml", "before_state.json"} and moved["before.toml"] == QUILL
+    assert ModelLoop(config, present, moved).state.phase == "watching"
+
+
+def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() -> None:
+    better = ComparisonData(
+        verdict=ComparisonVerdict.BETTER,
+        measured_by="sensor",
+        present_rms_um=5.0,
+        candidate_rms_um=1.0,
+        deviations=9.0,
+        ratio=0.3,
+    )
+    for verdict, may in ((judged(ALIKE, 2.5, 0.8), False), (judged(ALIKE, 0.5, 1.0), True)):
+        loop, now_ns = watching(verdict)
+        loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
+        assert loop.state.found is not None
+        loop.state.found.verdict = better
+        assert loop._may_adopt(loop.state.found, now_ns) == may
 
 
 def test_a_candidate_neither_replaces_a_decided_exchange_nor_outlives_it() -> None:
-    loop, now_ns = watching(50.0, judged(WORSE, -9.0, 3.0))
-    loop.state.exchange = "back"
+    loop, now_ns = watching(judged(WORSE, -9.0, 3.0))
+    loop.state.exchange, loop.state.incoming = "back", "watched"
     assert follows(loop, now_ns) == ("nothing", "waits")
     for sha256 in ("c" * 64, ""):
-        loop, now_ns = watching(50.0, judged(WORSE, -9.0, 3.0))
-        assert loop.state.shadow is not None
-        loop.state.exchange = "adopt"
+        loop, now_ns = watching(judged(WORSE, -9.0, 3.0))
+        loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
+        loop.state.exchange, loop.state.incoming = "adopt", "found"
         running = loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=1, why="planned", candidate_sha256=sha256)
-        loop.exchanged(now_ns, "d" * 64)
+        assert loop.exchanged(now_ns, "d" * 64) == "watched"
         assert loop.state.diagnosis == (None if sha256 else running)
-        assert loop.state.phase == "watching" and loop.state.shadow.sha256 == "d" * 64
+        assert loop.state.phase == "watching" and loop.state.watched is not None
+        assert loop.state.watched.sha256 == "d" * 64 and loop.state.found is None
 
 
-async def test_the_service_keeps_the_model_before_over_a_kill_and_its_replay_decides_the_same(tmp_path: Path) -> None:
+def test_after_a_way_back_what_is_avoided_or_in_force_is_compared_no_longer() -> None:
+    for sha256, effects, stays in (
+        ("b" * 64, ["input:coolant_degc"], True),
+        ("b" * 64, ["gain:DTF"], False),  # it was gone back from these
+        ("a" * 64, [], False),
+    ):
+        loop, now_ns = watching(judged(ComparisonVerdict.BETTER, 9.0, 0.3))
+        loop.shadow_begins(sha256, effects, now_ns, role="candidate" if effects else "before")
+        loop.state.exchange, loop.state.incoming = "back", "watched"
+        assert loop.exchanged(now_ns + HOUR_NS, "d" * 64) is None
+        assert loop.state.watched is None and (loop.state.found is not None) == stays
+        if loop.state.found is not None:
+            assert loop.state.found.since_utc_ns == now_ns + HOUR_NS
+
+
+async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_the_same_of_both(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()), shown(extended(2.0)))
     await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
-    await machine.run_and_kill(200)
-    await machine.run(1000, until=lambda _: len(machine.asked) == 2)
-    await machine.run(20)
-    assert machine.steps()[2:] == [("adopt", ""), ("diagnose", "planned"), ("nothing", "waits")]
-    assert machine.events("loop")[-1].text.startswith("input:coolant_degc: waits while the model before")
-    assert {one.role for one in machine.candidates()[-20:]} == {"before"}
+    await machine.run(1200, until=in_phase(machine, "shadow"))
+    await machine.run_and_kill(100)
+    await machine.run(30)
+    assert machine.steps()[2:] == [("adopt", ""), ("diagnose", "planned"), ("shadow", "")]
+    last = machine.candidates()[-60:]
+    assert [(one.role, one.model_sha256) for one in last] == 30 * [
+        ("before", sha256_of(QUILL)),
+        ("candidate", sha256_of(extended(2.0))),
+    ]
+    status = next(json.loads(sent) for name, sent in reversed(machine.published) if name == "status")
+    assert status["loop"]["effects"] == ["input:coolant_degc"] and status["loop"]["before_effects"] == []
     checked(machine)
+    path = recordings(machine.recordings, MACHINE)[-1]
+    opening = opening_of(path)
+    assert (opening["before.toml"], opening["candidate.toml"]) == (QUILL, extended(2.0))
+    for role in (b'"role":"before"', b'"role":"candidate"'):
+        one_left_out = replayed(path, lambda group, role=role: [one for one in group if role not in one.body])
+        assert one_left_out.topic == "candidate"
 
 
 async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_operators_yes(
@@ -166,5 +345,45 @@ async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_opera
     await machine.run(1800, until=at_adoption)
     assert warmed.is_set() and machine.steps()[-2:] == [("shadow", ""), ("adopt", "by_hand")]
     assert {one.role for one in machine.candidates()[-29:]} == {"before"}
-    assert opening_of(recordings(machine.recordings, MACHINE)[-1])["candidate.toml"] == QUILL
+    assert opening_of(recordings(machine.recordings, MACHINE)[-1])["before.toml"] == QUILL
     checked(machine)
+
+
+async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, outcomes = settings(), list[Outcome]()
+    present = Compensation(config, parse_model(extended(), source="present"))
+    before = Compensation(config, parse_model(QUILL, source="before"))
+    for one in machine(30):
+        outcomes.append(present.process(one))
+        before.process(one)
+    core = ModelLoop(config, present.model, {})
+    core.state.watched = Place(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
+    core.state.exchange, core.state.incoming = "back", "watched"
+    core.shadows["watched"] = Shadow(before, QUILL)
+    store = ModelStore(tmp_path, QUILL)
+    store.adopt(extended(), name="extended", time_utc_ns=1, by_loop=True)
+    events, files = Mock(), Mock()
+    loop = live.LiveLoop(
+        config,
+        live.LoopParts(core=core, model=extended(), store=store, diagnose=Mock()),
+        tmp_path,
+        events=events,
+        journal=files,
+        clock=Mock(utc_ns=lambda: 2),
+    )
+
+    async def sample() -> Compensation:
+        loop.after_sample(outcomes[-1])
+        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+        loop.hand_over(present)
+        return loop.before_sample(present)
+
+    works = model_store.replace_file
+    monkeypatch.setattr(model_store, "replace_file", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    assert [await sample() for _ in range(3)] == 3 * [present]
+    assert core.state.exchange == "back" and not events.note.called and store.in_use() == extended()
+    monkeypatch.setattr(model_store, "replace_file", works)
+    assert await sample() is before
+    assert store.in_use() == QUILL and core.state.phase == "idle" and core.state.exchange == ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import CapaNcdt, IcpDas, ModbusRtuLine, ModbusTcpServer, Rack
+from tests.service.shared_time import SharedTime, TimedRack
 from tests.service.simulated import START_NS, TABLE, config
 
 CHANNELS = [
@@ -30,6 +32,12 @@ CHANNELS = [
         strict=True,
     )
 ]
+
+
+#: The fault begins after so many samples.
+BEGIN = 40
+#: Time of the drivers between two polls from then on, s.
+POLL_S = 1.0
 
 
 class Wired:
@@ -50,6 +58,9 @@ class Wired:
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
             self.capa.push(1)
+            if len(self.outcomes) >= BEGIN:
+                # The drivers' own time goes on as well, or no line would be opened again.
+                await asyncio.sleep(POLL_S)
 
         self.daemon = Daemon(
             config=self.config,
@@ -108,55 +119,52 @@ class Wired:
             await self.fleet.close()
 
 
+#: How a line or a device fails and comes back; every kind on every carrier is in `device_faults`.
 FAULTS = [
     ("couples", "silence", {}, "t_q_degc"),
-    ("couples", "exception", {}, "t_q_degc"),
-    ("couples", "garbage", {}, "t_q_degc"),
     ("couples", "bad_crc", {}, "t_q_degc"),
-    ("couples", "wrong_length", {}, "t_q_degc"),
     ("couples", "disconnect", {}, "t_q_degc"),
     ("couples", "late", {"delay_s": 0.8}, "t_q_degc"),
     ("couples", "open", {"input": 0}, "t_q_degc"),
-    ("couples", "over", {"input": 0}, "t_q_degc"),
-    ("couples", "under", {"input": 0}, "t_q_degc"),
     ("cabinet", "silence", {}, "at_degc"),
     ("cabinet", "disconnect", {}, "at_degc"),
     ("cabinet", "open", {"input": 0}, "at_degc"),
     ("probe", "silence", {}, "y_um"),
-    ("probe", "disconnect", {}, "y_um"),
     ("probe", "over", {"input": 1}, "y_um"),
 ]
 
 
 @pytest.mark.parametrize(("device", "fault", "parameters", "channel"), FAULTS)
-async def test_a_fault_is_missing_never_a_number_and_heals(
+def test_a_fault_is_missing_never_a_number_and_heals(
     tmp_path: Path, device: str, fault: str, parameters: dict[str, Any], channel: str
 ) -> None:
-    with Rack() as rack:
+    shared = SharedTime()
+
+    async def run() -> None:
         wired = Wired(rack, tmp_path)
         faults = {"couples": wired.rtu.module(1), "cabinet": wired.tcp.module(1), "probe": wired.capa}[device].faults
-        wired.at_sample[40] = lambda: faults.set(fault, **parameters)
-        wired.at_sample[48] = faults.clear
+        wired.at_sample[BEGIN] = lambda: faults.set(fault, **parameters)
+        wired.at_sample[BEGIN + 8] = faults.clear
 
         def healed(w: Wired) -> bool:
             return len(w.outcomes) > 60 and all(
                 o.sample.channels[channel].quality == "good" and o.offset.state == "ok" for o in w.outcomes[-5:]
             )
 
-        await wired.run(3000, healed)
+        await wired.run(300, healed)
         outcomes = wired.outcomes
         assert healed(wired), outcomes[-1].offset
-        bad = [o.sample.channels[channel] for o in outcomes[41:47]]
+        bad = [o.sample.channels[channel] for o in outcomes[BEGIN + 1 : BEGIN + 7]]
         assert all(c.quality != "good" and c.count == 0 and math.isnan(number(c.mean)) for c in bad), bad
         if channel == "y_um":
-            assert all(o.offset.state == "ok" for o in outcomes[41:47]), [
+            assert all(o.offset.state == "ok" for o in outcomes[BEGIN + 1 : BEGIN + 7]), [
                 (o.offset.state, o.offset.reasons, {n: (c.quality, c.errors) for n, c in o.sample.channels.items()})
-                for o in outcomes[41:47]
+                for o in outcomes[BEGIN + 1 : BEGIN + 7]
             ]
-            assert all(math.isnan(number(o.estimate.residual_um)) for o in outcomes[41:47])
+            assert all(math.isnan(number(o.estimate.residual_um)) for o in outcomes[BEGIN + 1 : BEGIN + 7])
         else:
-            assert all(o.offset.state in ("degraded", "hold") for o in outcomes[41:47])
-            assert all(not math.isnan(number(o.offset.y_offset_um)) for o in outcomes[41:47])
+            assert all(o.offset.state in ("degraded", "hold") for o in outcomes[BEGIN + 1 : BEGIN + 7])
+            assert all(not math.isnan(number(o.offset.y_offset_um)) for o in outcomes[BEGIN + 1 : BEGIN + 7])
         # A line that opens late on a busy machine leaves the first samples without an offset; from the first number
         # on there is always one, and it never jumps.
         started = next(i for i, o in enumerate(outcomes) if o.offset.state != "starting")
@@ -166,3 +174,6 @@ async def test_a_fault_is_missing_never_a_number_and_heals(
         assert not jumps, [outcomes[started + i + 1].offset for i in jumps[:2]]
         times = [o.offset.time_utc_ns for o in outcomes]
         assert all(b - a == 60_000_000_000 for a, b in itertools.pairwise(times))
+
+    with TimedRack(shared) as rack:
+        shared.run(run())

@@ -39,7 +39,7 @@ class Measured(Machine):
     """A machine whose displacement sensor has noise, and more that is not deformation."""
 
     def __init__(self, folder: Path, more: Callable[[int], float] = lambda sample: 0.0, **options: Any) -> None:
-        data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
+        data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 60.0")
         super().__init__(folder, options.pop("config", parse_config(data, source="test")), **options)
         self.config_bytes = data
         rng = np.random.default_rng(7)

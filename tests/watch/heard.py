@@ -131,7 +131,8 @@ LOOP: dict[str, Any] = {
     "since_utc_ns": START_NS - 3600 * NS,
     "y_pred_um": 11.0,
     "verdict": "better",
-    "text": "last 12 h: present 6.9 µm rms, this one 1.2 (better by 31 standard deviations of the difference)",
+    "text": "last 12 h: present 6.9 µm rms, this one 1.2 (better: the present one is refuted by 31 "
+    "standard deviations)",
     "present_rms_um": 6.9,
     "candidate_rms_um": 1.2,
     "deviations": 31.0,

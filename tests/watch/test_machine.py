@@ -10,6 +10,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages_axes import AxesEstimate
 from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
 from compensator.watch.shop import Shop
@@ -285,6 +286,17 @@ def test_the_past_of_a_recording_says_nothing_of_now() -> None:
     assert len(machine.events) == 2
 
 
+def test_the_recorded_day_of_a_machine_of_several_axes_is_shown() -> None:
+    machine = WatchedMachine("shop/vmc-07")
+    fields = json.loads(estimate(3)) | {"axes": {"z_pred_um": 4.0, "z_std_um": 0.5}}
+    machine.add_recorded(msgspec.convert(fields, AxesEstimate))
+    machine.add_recorded(msgspec.json.decode(sample(3), type=Sample))
+    assert machine.history.columns()["residual_um"] == [-0.34]
+    assert machine.snapshot(START_NS, 0.0)["residual_um"] == -0.34
+    machine.update("estimate", estimate(4, residual_um=0.5), 0.0)
+    assert machine.snapshot(START_NS, 0.0)["residual_um"] == 0.5
+
+
 def test_samples_of_a_slow_model_are_one_interval() -> None:
     day = {"t_s": [0.0, 300.0, 600.0, 2000.0], "state": ["ok"] * 4, "reasons": [""] * 4}
     intervals = [(interval.begin_s, interval.end_s) for interval in state_intervals(day, 750.0)]
@@ -326,6 +338,10 @@ def test_a_proposed_model_is_shown_with_its_figures_and_what_a_person_can_answer
     assert "a better one is proposed, with input:coolant_degc" in found["line"]
     assert "present 6.9 µm rms, this one 1.2" in found["line"]
     assert [command.split()[1] for command in found["commands"]] == ["adopt", "dismiss"]
+    assert "goes on" not in found["line"]
+    beside = LOOP | {"before_effects": ["gain:DTF"], "before_text": "no verdict: no zero was set yet"}
+    heard.hear(status=status(7, START_NS + 120 * NS, loop=beside))
+    assert "The one before the last change (gain:DTF) goes on, too: no verdict" in heard.machine["loop"]["line"]
     heard.clock.advance(600)  # an old status says nothing about now
     assert "loop" not in heard.machine
 

@@ -17,26 +17,31 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
+from compensator.service.loop.one_place import use_both
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
-from compensator.service.loop.state import LoopState, decode_loop
+from compensator.service.loop.state import LoopState, PlaceName, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
 from compensator.service.status import Zero
 from compensator.service.transfer.second_opinion import described
 
-#: Attachments of a recording: state of the loop, and model file and state of the shadow.
-LOOP_STATE, SHADOW_MODEL, SHADOW_STATE = "loop.json", "candidate.toml", "candidate_state.json"
+#: Attachments of a recording: state of the loop, and model file and state of each shadow, by place.
+LOOP_STATE = "loop.json"
+SHADOW_FILES: Mapping[PlaceName, tuple[str, str]] = {
+    "found": ("candidate.toml", "candidate_state.json"),
+    "watched": ("before.toml", "before_state.json"),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """What the loop made of a sample: the record of the shadow, if there is one, and events."""
+    """What the loop made of a sample: the records of the models in shadow, and events."""
 
-    candidate: Candidate | None
+    candidates: tuple[Candidate, ...]
     notes: tuple[Note, ...]
 
 
 class ModelLoop:
-    """The loop of one machine, with the shadow's compensation.
+    """The loop of one machine, with the compensations of the models in shadow.
 
     Parameters
     ----------
@@ -62,53 +67,79 @@ class ModelLoop:
         data = attachments.get(LOOP_STATE)
         state = decode_loop(data) if data is not None else None
         self.loop = Loop(config.loop, present.period_s, effect_names(present), state)
-        self.shadow: Shadow | None = None
-        if self.state.shadow is not None:
-            if not {SHADOW_MODEL, SHADOW_STATE} <= attachments.keys():
-                raise DataError(f"loop.json names a shadow, but {SHADOW_MODEL} or {SHADOW_STATE} is missing")
-            self.shadow = Shadow.of(config, attachments[SHADOW_MODEL], attachments[SHADOW_STATE])
+        #: The models in shadow, by place; one without a place has ended, and goes before the next sample.
+        self.shadows: dict[PlaceName, Shadow] = {}
+        for name in self.state.taken:
+            files = SHADOW_FILES[name]
+            if not attachments.keys() >= set(files):
+                raise DataError(f"loop.json names a model in shadow, but {' or '.join(files)} is missing")
+            self.shadows[name] = Shadow.of(config, *(attachments[file] for file in files))
 
     @property
     def state(self) -> LoopState:
         """State of the loop."""
         return self.loop.state
 
+    @property
+    def incoming(self) -> Shadow | None:
+        """The model that replaces the present one before the next sample; None without an exchange."""
+        return self.shadows.get(self.state.incoming) if self.state.exchange else None
+
     def attachments(self) -> dict[str, bytes]:
         """Return what a recording must begin with."""
         found = {LOOP_STATE: msgspec.json.encode(self.state)}
-        if self.shadow is not None and self.state.shadow is not None:
-            found |= {SHADOW_MODEL: self.shadow.data, SHADOW_STATE: self.shadow.compensation.state()}
+        for name in self.state.taken:
+            shadow = self.shadows[name]
+            found |= zip(SHADOW_FILES[name], (shadow.data, shadow.compensation.state()), strict=True)
         return found
+
+    def use_both_places(self) -> None:
+        """Go on with two places after a recording with one."""
+        one = self.shadows.get("found")
+        use_both(self.state)
+        if one is not None and self.state.watched is not None and self.state.found is None:
+            self.shadows = {"watched": one}
 
     # ------------------------------------------------------------------ one sample
 
     def process(self, outcome: Outcome) -> Followed:
         """Process a sample after the present compensation."""
-        compared = self.state.shadow
-        if self.shadow is None or compared is None:
-            return Followed(None, tuple(self.loop.step(outcome, None)))
-        present, other = self.shadow.process(outcome)
-        notes = self.loop.step(present, other)
-        verdict, probes = self.state.verdict, len(self.state.comparison.probes)
-        message = candidate_message(present, other, compared.role, verdict, self.loop.judged_h, probes)
-        return Followed(message, tuple(notes))
+        places = self.state.taken
+        if not places:
+            return Followed((), tuple(self.loop.step(outcome, {})))
+        present, others = outcome, dict[PlaceName, Outcome]()
+        for name in places:
+            present, others[name] = self.shadows[name].process(outcome)
+        notes = self.loop.step(present, others)
+        messages = tuple(
+            candidate_message(
+                present,
+                others[name],
+                place.role,
+                place.verdict,
+                self.loop.judged_h(place),
+                len(place.comparison.probes),
+            )
+            for name, place in places.items()
+        )
+        return Followed(messages, tuple(notes))
 
     def resume(self) -> None:
         """Acknowledge exchanged sensors, as the present compensation does at an operator's `resume`."""
-        if self.shadow is not None:
-            self.shadow.compensation.resume()
+        for shadow in self.shadows.values():
+            shadow.compensation.resume()
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured, as the present compensation does."""
-        if self.shadow is not None:
-            self.shadow.compensation.pause(samples)
+        for shadow in self.shadows.values():
+            shadow.compensation.pause(samples)
 
     # ------------------------------------------------------------------ between two samples
 
     def weigh(self, found: Diagnosed, *, calibrated: bytes) -> Weighed:
         """Return what follows from a diagnosis; `receive` decides by it."""
-        shadow = self.shadow.compensation.model if self.shadow is not None and self.state.shadow is not None else None
-        weighed = weigh(found, self._config, calibrated=calibrated, present=self.present, shadow=shadow)
+        in_shadow = [place.sha256 for place in self.state.taken.values()]
+        weighed = weigh(found, self._config, calibrated=calibrated, present=self.present, in_shadow=in_shadow)
         return self._of_its_time(weighed)
 
     def plain(self, found: Diagnosed) -> Weighed:
@@ -129,14 +160,13 @@ class ModelLoop:
     def begin_shadow(
         self, compensation: Compensation, data: bytes, now_ns: int, role: Role, error: ErrorBlocks
     ) -> None:
-        """Begin to compare another model that is in its state after the last sample, with its error on the record."""
-        if self.shadow is None or self.shadow.compensation.model.sha256 != compensation.model.sha256:
-            self.shadow = Shadow(compensation, data)
+        """Begin to compare what a diagnosis has found, in its state after the last sample, with its error on record."""
         model = compensation.model
+        self.shadows["found"] = Shadow(compensation, data)
         self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
 
-    def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes]:
-        """Let the shadow continue from the present compensation; that one becomes the shadow, or ends after a way back.
+    def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes, Note]:
+        """Let a model in shadow continue from the present one; that goes into shadow, or ends after a way back.
 
         Parameters
         ----------
@@ -149,30 +179,35 @@ class ModelLoop:
 
         Returns
         -------
-        Compensation, bytes
-            The compensation for the next sample, and its model file.
+        Compensation, bytes, Note
+            The compensation for the next sample, its model file, and the event of the exchange.
         """
-        assert self.shadow is not None
-        new = self.shadow
+        state, incoming = self.state, self.state.place(self.state.incoming)
+        assert incoming is not None
+        action, verdict, level_um = state.exchange, incoming.verdict, state.level_um
+        new = self.shadows.pop(state.incoming)
         handover = present.status.handover
-        new.compensation.raise_level(self.state.level_um)
+        new.compensation.raise_level(level_um)
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
-        self.loop.exchanged(now_ns, present.model.sha256)
+        outgoing = self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
         # What holds the published offset concerns the new one only.
         present.continue_from(replace(handover, operator_hold=False, internal_error=False, probing=None))
-        self.shadow = Shadow(present, data) if self.state.shadow is not None else None
-        return new.compensation, new.data
+        if outgoing is not None:
+            self.shadows[outgoing] = Shadow(present, data)
+        self.drop_ended()
+        note = _exchange_note(action, present, new.compensation, verdict, level_um)
+        return new.compensation, new.data, note
 
     def drop_ended(self) -> bool:
-        """Let go of a shadow that has ended; return whether there was one."""
-        if self.shadow is None or self.state.shadow is not None:
-            return False
-        self.shadow = None
-        return True
+        """Let go of what is in shadow no longer; return whether there was something."""
+        ended = self.shadows.keys() - self.state.taken.keys()
+        for name in ended:
+            del self.shadows[name]
+        return bool(ended)
 
 
-def exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData, level_um: float) -> Note:
+def _exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData, level_um: float) -> Note:
     """Return the event of an exchange that the loop has made, after it."""
     before, after = old.status, new.status
     difference = after.target_um - before.target_um

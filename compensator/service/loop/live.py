@@ -20,12 +20,13 @@ from compensator.messages import Candidate, LoopStatus
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
-from compensator.service.loop.core import Followed, ModelLoop, exchange_note
+from compensator.service.loop.core import Followed, ModelLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.status import loop_status
 from compensator.service.loop.weighing import Weighed, effect_names
 from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
@@ -100,7 +101,7 @@ class LiveLoop:
         self._events, self._journal, self._clock = events, journal, clock
         #: None after an internal error of the loop: it stays off until the next start.
         self._core: ModelLoop | None = parts.core
-        self._candidate: Candidate | None = None
+        self._candidates: tuple[Candidate, ...] = ()
         #: The diagnosis or warm-up in progress, and what it gave; a model that is being stored, and why it was not.
         self._task: asyncio.Task[None] | None = None
         self._found: _Found | None = None
@@ -137,11 +138,11 @@ class LiveLoop:
             self._begin_shadow(core, warmed, warmed.compensation)
         if not (core.state.exchange and self._stored):
             return present
-        verdict, action, self._stored = core.state.verdict, core.state.exchange, False
-        new, self._model = core.exchange(present, self._model, present.status.time_utc_ns)
+        self._stored = False
+        new, self._model, note = core.exchange(present, self._model, present.status.time_utc_ns)
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
-        self._events.note(*exchange_note(action, present, new, verdict, core.state.level_um))
+        self._events.note(*note)
         return new
 
     def _begin_shadow(self, core: ModelLoop, warmed: _Found, compensation: Compensation) -> None:
@@ -171,10 +172,10 @@ class LiveLoop:
             if core.state.diagnosis is not None and found.weighed.candidate is not None:
                 self._warming = found
                 self._task = asyncio.create_task(self._warm_up(found, found.weighed.candidate))
-        why = self._not_stored or (self._warming.why if self._warming is not None else "")
-        if why:
-            self._not_stored, self._warming = "", None
-            self._give_up(core, why)
+        if self._warming is not None and self._warming.why:
+            self._end_one(core, "", self._warming.why)
+        if self._not_stored:
+            self._end_not_stored(core)
 
     def resume(self) -> None:
         """Pass on an operator's `resume`."""
@@ -203,14 +204,15 @@ class LiveLoop:
             If there is no candidate, or it is not proposed and `force` is not given.
         """
         state = self._core.state if self._core is not None else None
-        if state is None or state.shadow is None or state.shadow.role != "candidate" or state.exchange:
+        candidate = state.candidate if state is not None and not state.exchange else None
+        if candidate is None:
             raise ServiceError("there is no candidate now; see `compensator watch`")
-        words = f"{state.shadow.sha256[:12]} ({', '.join(state.shadow.effects) or 'no added effect'})"
-        if state.phase != "proposed" and not force:
+        words = f"{candidate.sha256[:12]} ({', '.join(candidate.effects) or 'no added effect'})"
+        if not candidate.is_proposed and not force:
             raise ServiceError(
-                f"candidate {words} is not proposed yet: {described(state.verdict)}; wait, or use --force"
+                f"candidate {words} is not proposed yet: {described(candidate.verdict)}; wait, or use --force"
             )
-        return f"candidate {words} is adopted; {described(state.verdict)}"
+        return f"candidate {words} is adopted; {described(candidate.verdict)}"
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""
@@ -229,11 +231,11 @@ class LiveLoop:
 
     # ------------------------------------------------------------------ one sample
 
-    def process(self, outcome: Outcome) -> Candidate | None:
-        """Process a sample after the present compensation; return the record of the shadow."""
+    def process(self, outcome: Outcome) -> tuple[Candidate, ...]:
+        """Process a sample after the present compensation; return the records of the models in shadow."""
         core = self._core
         if core is None:
-            return None
+            return ()
         try:
             followed = core.process(outcome)
         except Exception as error:
@@ -241,20 +243,20 @@ class LiveLoop:
             log.exception("internal error of the model in shadow")
             followed = self._without_shadow(core, outcome, f"internal error: {type(error).__name__}: {error}")
         self._note(followed.notes)
-        self._candidate = followed.candidate
-        return followed.candidate
+        self._candidates = followed.candidates
+        return followed.candidates
 
     def _without_shadow(self, core: ModelLoop, outcome: Outcome, why: str) -> Followed:
         """End the shadow, or the loop if that fails too."""
         try:
             self._give_up(core, why)
-            return Followed(None, tuple(core.loop.step(outcome, None)))
+            return Followed((), tuple(core.loop.step(outcome, {})))
         except Exception:
             log.exception("internal error of the loop; it is off until the next start")
             self._cancel()
             self._core = None
             self._journal.start_new_file()
-            return Followed(None, ())
+            return Followed((), ())
 
     def after_sample(self, outcome: Outcome) -> None:
         """Begin what was decided with a sample that is published."""
@@ -271,26 +273,7 @@ class LiveLoop:
 
     def status(self) -> LoopStatus | None:
         """Return how the loop is, for `thermal/status`; None if it is off."""
-        if self._core is None:
-            return None
-        state, found = self._core.state, self._candidate
-        shadow = state.shadow
-        return LoopStatus(
-            phase=state.phase,
-            diagnosing=state.diagnosis is not None,
-            model_sha256=shadow.sha256 if shadow is not None else "",
-            effects=shadow.effects if shadow is not None else [],
-            since_utc_ns=shadow.since_utc_ns if shadow is not None else 0,
-            y_pred_um=found.y_pred_um if found is not None and shadow is not None else None,
-            verdict=state.verdict.verdict,
-            text=described(state.verdict) if shadow is not None else "",
-            present_rms_um=state.verdict.present_rms_um,
-            candidate_rms_um=state.verdict.candidate_rms_um,
-            deviations=state.verdict.deviations,
-            hours=self._core.loop.judged_h,
-            probes=len(state.comparison.probes),
-            adopted_utc_ns=state.adopted_utc_ns,
-        )
+        return loop_status(self._core, self._candidates) if self._core is not None else None
 
     async def end(self) -> None:
         """End what is in progress: a diagnosis is begun again at the next start, a stored model is used then."""
@@ -339,7 +322,7 @@ class LiveLoop:
 
     async def _store_model(self, core: ModelLoop) -> None:
         """Store the model in shadow for the next start; then it is used from the next sample on."""
-        action, shadow = core.state.exchange, core.shadow
+        action, shadow = core.state.exchange, core.incoming
         assert shadow is not None
         model, now_ns = shadow.compensation.model, self._clock.utc_ns()
 
@@ -364,13 +347,31 @@ class LiveLoop:
         self._stored, self._not_stored = False, ""
 
     def _give_up(self, core: ModelLoop, why: str) -> None:
+        """End everything in shadow."""
         self._warming = None
-        if core.state.shadow is None and core.state.diagnosis is None:
-            data = LoopData(step=LoopAction.END, why=FAILED_OUTSIDE)
-            self._events.note(EventKind.LOOP, why, data.table())
+        ended = core.loop.give_up(FAILED_OUTSIDE, why)
+        self._note(ended or [_failed(why)])
+
+    def _end_one(self, core: ModelLoop, sha256: str, why: str) -> None:
+        """End a candidate: that in shadow, or one whose warm-up has failed."""
+        self._warming = None
+        ended = core.loop.give_up_one(sha256, FAILED_OUTSIDE, why)
+        self._note(ended or [_failed(why)])
+
+    def _end_not_stored(self, core: ModelLoop) -> None:
+        why, self._not_stored = self._not_stored, ""
+        incoming = core.incoming
+        if incoming is None or core.state.exchange == "back":
+            # The way back stays open: the model is stored again with the next sample.
+            log.error("the way back waits: %s", why)
             return
-        self._note(core.loop.give_up(FAILED_OUTSIDE, why))
+        self._end_one(core, incoming.compensation.model.sha256, why)
 
     def _note(self, notes: list[Note] | tuple[Note, ...]) -> None:
         for note in notes:
             self._events.note(*note)
+
+
+def _failed(why: str) -> Note:
+    """Return the event of a cause outside of the loop that has ended no model in shadow."""
+    return Note(EventKind.LOOP, why, LoopData(step=LoopAction.END, why=FAILED_OUTSIDE).table())

@@ -1,7 +1,7 @@
-"""Who has the place of the shadow: whether what a diagnosis finds gets it.
+"""Which of the two places beside the present model a model gets, and what follows from a diagnosis.
 
-A candidate gives it to that of a later diagnosis, which knows more. The model before an adoption keeps it until it is
-no longer needed: a candidate that took it at once would end the comparison by which the service goes back.
+What a diagnosis finds gives its place to what a later one finds, which knows more. The model before an adoption has a
+place of its own for as long as it is watched: the way back does not depend on what is found meanwhile.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState
+from compensator.service.loop.state import LoopState, PlaceName
 
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
@@ -28,9 +28,10 @@ _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 _HOUR_NS = 3600 * NS
 
 
-def remembered_h(settings: LoopSettings) -> float:
+def remembered_h(settings: LoopSettings, role: Role) -> float:
     """Return for how long what is compared counts, h."""
-    return max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
+    hours = max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
+    return max(settings.record_h, hours) if role == "candidate" else hours
 
 
 def role_of(found: DiagnosisData) -> Role:
@@ -40,30 +41,40 @@ def role_of(found: DiagnosisData) -> Role:
 
 def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, now_ns: int) -> str:
     """Return why no candidate follows from a diagnosis; empty if one does."""
-    shadow, role = state.shadow, role_of(found)
+    role = role_of(found)
     if found.refused:
         return "refused"
     if not found.candidate_sha256:
         return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
     if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
         return "unchanged"
-    if found.in_shadow and shadow is not None and shadow.role == role:
+    # In two places, a model that runs in one is compared, and gone back to or adopted, from there.
+    if found.in_shadow and any(state.places > 1 or place.role == role for place in state.taken.values()):
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
     if takes_over(state, role, found.effects):
-        assert shadow is not None
+        assert state.candidate is not None
         # What gave its place too often would never be compared for its own hours.
-        return "in_shadow" if now_ns - shadow.since_utc_ns < settings.shadow_h * _HOUR_NS else ""
-    return "waits" if has_to_wait(state, settings, now_ns, same_effects=found.same_effects) else ""
+        return "in_shadow" if now_ns - state.candidate.since_utc_ns < settings.shadow_h * _HOUR_NS else ""
+    return "waits" if state.exchange else ""
 
 
 def takes_over(state: LoopState, role: Role, effects: Sequence[str]) -> bool:
     """Return whether a candidate has the effects of the one in shadow: then the comparison goes on with it."""
-    shadow = state.shadow
-    if shadow is None or role != "candidate" or shadow.role != role:
+    candidate = state.candidate
+    if candidate is None or role != "candidate":
         return False
-    return not state.exchange and sorted(shadow.effects) == sorted(effects)
+    return not state.exchange and sorted(candidate.effects) == sorted(effects)
+
+
+def place_of_outgoing(state: LoopState, effects: Sequence[str], adopted: Sequence[str]) -> PlaceName:
+    """Return the place that the present model gets at an adoption.
+
+    Other parameters of the same effects end with the same effect: a model before them stays the one that is watched.
+    """
+    is_refined = state.watched is not None and sorted(effects) == sorted(adopted)
+    return "found" if is_refined or state.places == 1 else "watched"
 
 
 def leads(found: ComparisonData, settings: LoopSettings) -> bool:
@@ -71,22 +82,3 @@ def leads(found: ComparisonData, settings: LoopSettings) -> bool:
     if found.deviations is None or found.ratio is None:
         return False
     return found.deviations >= LEADS * settings.deviations and found.ratio <= BETTER_PART
-
-
-def has_to_wait(state: LoopState, settings: LoopSettings, now_ns: int, *, same_effects: bool) -> bool:
-    """Return whether what a diagnosis finds now has to wait for a later diagnosis.
-
-    The model before an adoption keeps its place until it has been judged and is not better so far: else the service may
-    have to go back to it. Without a misfit it also keeps it until an adoption is permitted again, and from other
-    parameters of the same effects until it is clearly worse than the adopted model.
-    """
-    shadow, verdict = state.shadow, state.verdict.verdict
-    if state.exchange:
-        return True
-    if shadow is None or shadow.role != "before" or shadow.since_utc_ns != state.adopted_utc_ns:
-        return False
-    if verdict == ComparisonVerdict.NOT_JUDGED or leads(state.verdict, settings):
-        return True
-    errs = state.misfit_min >= 60.0 * settings.misfit_h
-    is_early = now_ns - shadow.since_utc_ns < ADOPTION_H * _HOUR_NS
-    return not errs and (is_early or (same_effects and verdict != ComparisonVerdict.WORSE))

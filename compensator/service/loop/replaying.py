@@ -73,7 +73,7 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
     elif event.kind == EventKind.LOOP:
         data = data_of(event, LoopData)
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
-            core.loop.give_up(FAILED_OUTSIDE, event.text)
+            core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
     return []
 
 

@@ -16,7 +16,7 @@ from compensator.events import Note
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.core import LOOP_STATE, ModelLoop, exchange_note
+from compensator.service.loop.core import LOOP_STATE, ModelLoop
 from compensator.service.loop.replaying import RecordedLoop, recorded_loop
 from compensator.service.loop.weighing import effect_names
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
@@ -55,28 +55,25 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     if last.config == loaded.data:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()
+            core.use_both_places()
             return core
-        if core.state.exchange and core.shadow is not None and _sha256(core) == present.model.sha256:
+        if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
             resumed.notes.append(_complete(resumed, last))
+            core.use_both_places()
             return core
     core.drop_ended()
     notes: list[Note] = core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
     resumed.notes += notes
     core.drop_ended()
+    core.use_both_places()
     return ModelLoop(config, present.model, core.attachments())
 
 
 def _complete(resumed: Resumed, last: _Replayed) -> Note:
     """Complete an exchange whose model is stored already."""
-    core, old = last.loop.core, last.compensation
-    verdict, action = core.state.verdict, core.state.exchange
-    new, _ = core.exchange(old, last.model, old.status.time_utc_ns)
-    resumed.compensation = new
-    return exchange_note(action, old, new, verdict, core.state.level_um)
-
-
-def _sha256(core: ModelLoop) -> str:
-    return core.shadow.compensation.model.sha256 if core.shadow is not None else ""
+    old = last.compensation
+    resumed.compensation, _, note = last.loop.core.exchange(old, last.model, old.status.time_utc_ns)
+    return note
 
 
 def _replayed(config: Config, folder: Path) -> _Replayed | None:

@@ -17,8 +17,8 @@ from compensator.config import Config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
 from compensator.messages import Candidate, Sample
-from compensator.service.compensation import Compensation, Outcome, model_of, slowest_min
-from compensator.service.loop.core import ModelLoop, exchange_note, is_rest, warmed_on
+from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
@@ -36,8 +36,8 @@ class LoopStep:
     ----------
     outcome : Outcome
         Of the present model.
-    candidate : Candidate or None
-        Record of the model in shadow; None without one.
+    candidates : tuple of Candidate
+        Records of the models in shadow.
     events : tuple of Note
         Events with this sample: those of the outcome, diagnoses, decisions and exchanges.
     model_sha256 : str
@@ -45,7 +45,7 @@ class LoopStep:
     """
 
     outcome: Outcome
-    candidate: Candidate | None
+    candidates: tuple[Candidate, ...]
     events: tuple[Note, ...]
     model_sha256: str
 
@@ -123,7 +123,7 @@ class LoopRun:
             record = [one for one in self._record if one.sample.time_utc_ns > wanted.from_utc_ns]
             self._found = self._diagnosed(record)
         events = (*notes, *outcome.notes, *followed.notes)
-        return LoopStep(outcome, followed.candidate, events, outcome.offset.model_sha256)
+        return LoopStep(outcome, followed.candidates, events, outcome.offset.model_sha256)
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured, as after a restart; see `Compensation.pause`."""
@@ -211,9 +211,8 @@ class LoopRun:
         return notes
 
     def _exchange(self, now_ns: int) -> Note:
-        old, action, verdict = self._compensation, self._core.state.exchange, self._core.state.verdict
-        self._compensation, self._data = self._core.exchange(old, self._data, now_ns)
-        return exchange_note(action, old, self._compensation, verdict, self._core.state.level_um)
+        self._compensation, self._data, note = self._core.exchange(self._compensation, self._data, now_ns)
+        return note
 
     def _diagnosed(self, record: Sequence[Outcome]) -> Diagnosed:
         try:
@@ -229,7 +228,7 @@ class LoopRun:
             self._at_rest, self._warm_ns = outcome, 0
         elif any(note.kind == EventKind.ZERO for note in outcome.notes):
             self._warm_ns = outcome.sample.time_utc_ns
-        warm_up_h = WARM_UP * slowest_min(self._compensation.model) / 60.0
+        warm_up_h = WARM_UP * self._compensation.slowest_min / 60.0
         oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * 3600 * NS)
         if self._warm_ns:
             # The deformation counts from what the model predicts at that zero, so its state must be known there.

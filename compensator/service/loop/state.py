@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -12,12 +12,15 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
-#: Version of the state; a state of another version is refused.
-STATE_SCHEMA = 1
+#: Version of the state; one of a later version is refused.
+STATE_SCHEMA = 2
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
-_NOTHING_YET = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NO_Y)
+#: The two places beside the present model: for what a diagnosis has found, and for the model before an adoption.
+PlaceName = Literal["found", "watched"]
+#: Before the first value.
+NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NO_Y)
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
@@ -30,13 +33,41 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     candidate_sha256: str = ""
 
 
-class Compared(msgspec.Struct, frozen=True, kw_only=True):
-    """The model in shadow: hash, effects, role, and when the comparison began."""
+class Place(msgspec.Struct, kw_only=True):
+    """A model in shadow, and what was compared of it and the present model.
+
+    Parameters
+    ----------
+    sha256 : str
+        Hash of its file.
+    effects : list of str
+        Its effects.
+    role : {"candidate", "before"}
+        Whether it may be adopted, or is a model that the service goes back to.
+    since_utc_ns : int
+        When the comparison began, ns since 1970 UTC.
+    is_proposed : bool
+        Whether a person was asked to adopt it.
+    comparison : ComparisonState
+        What was compared since then.
+    verdict : ComparisonData
+        The last verdict on it.
+    error : ErrorBlocks
+        Its errors since the last zero, on the record before the comparison, too.
+    """
 
     sha256: str
     effects: list[str]
     role: Role
     since_utc_ns: int
+    is_proposed: bool = False
+    comparison: ComparisonState = msgspec.field(default_factory=ComparisonState)
+    verdict: ComparisonData = NO_VERDICT
+    error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
+
+    def begin_anew(self) -> None:
+        """Forget what was compared."""
+        self.comparison, self.verdict = ComparisonState(), NO_VERDICT
 
 
 class Avoided(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,10 +84,10 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     ----------
     schema : int
         `STATE_SCHEMA`.
-    phase : {"idle", "shadow", "proposed", "watching"}
-        What the shadow is for.
     exchange : {"", "adopt", "back"}
         An exchange that was decided and happens before the next sample.
+    incoming : {"found", "watched"}
+        The place from which a model replaces the present one.
     level_um : float
         By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
@@ -65,58 +96,102 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min, clean_min : float
         For how long the model, and for how long no sensor, has been suspected, min.
-    shadow : Compared, optional
-        The model in shadow.
-    comparison : ComparisonState
-        What was compared since it began.
-    verdict : ComparisonData
-        The last verdict on it.
+    found : Place, optional
+        What a diagnosis has found: a candidate, or the calibrated model.
+    watched : Place, optional
+        The model before the last adoption.
+    places : {1, 2}
+        How many there are: recordings before version 2 of the state have one (`one_place`).
     adopted_utc_ns : int
         Time of the last adoption; 0 before.
     effects : list of str
         Effects of the present model.
-    error, other_error : ErrorBlocks
-        Errors of the present model and of the one in shadow since the last zero, on the record before it, too.
+    error : ErrorBlocks
+        Errors of the present model since the last zero.
     avoided : list of Avoided
         Models that were gone back from or dismissed.
     """
 
     schema: int = STATE_SCHEMA
-    phase: Phase = "idle"
     exchange: Exchange = ""
+    incoming: PlaceName = "found"
     level_um: float = 0.0
     diagnosis: Running | None = None
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
     clean_min: float = 0.0
-    shadow: Compared | None = None
-    comparison: ComparisonState = msgspec.field(default_factory=ComparisonState)
-    verdict: ComparisonData = _NOTHING_YET
+    found: Place | None = None
+    watched: Place | None = None
+    places: Literal[1, 2] = 2
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
-    other_error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     avoided: list[Avoided] = []
 
+    def place(self, name: PlaceName) -> Place | None:
+        """Return the model in a place."""
+        return self.found if name == "found" else self.watched
 
-def fresh() -> tuple[ComparisonState, ComparisonData]:
-    """Return a comparison before its first value."""
-    return ComparisonState(), _NOTHING_YET
+    def put(self, name: PlaceName, place: Place | None) -> None:
+        """Put a model in a place, or empty it."""
+        if name == "found":
+            self.found = place
+        else:
+            self.watched = place
+
+    @property
+    def taken(self) -> dict[PlaceName, Place]:
+        """The places that are taken, the way back first."""
+        both: tuple[tuple[PlaceName, Place | None], ...] = (("watched", self.watched), ("found", self.found))
+        return {name: place for name, place in both if place is not None}
+
+    @property
+    def candidate(self) -> Place | None:
+        """The candidate, if there is one."""
+        return self.found if self.found is not None and self.found.role == "candidate" else None
+
+    @property
+    def shown(self) -> Place | None:
+        """The model in shadow that concerns a person first: the candidate, or else a model that was in force."""
+        return self.candidate or self.watched or self.found
+
+    @property
+    def phase(self) -> Phase:
+        """What a person may have to answer to."""
+        if self.candidate is not None:
+            return "proposed" if self.candidate.is_proposed else "shadow"
+        return "watching" if self.taken else "idle"
 
 
 def decode_loop(data: bytes) -> LoopState:
-    """Read a state.
+    """Read a state; one of version 1 has one place.
 
     Raises
     ------
     DataError
-        If it is not a state of this version.
+        If it is not a state of this or an earlier version.
     """
     try:
-        state = msgspec.json.decode(data, type=LoopState)
+        read = msgspec.json.decode(data, type=dict[str, Any])
+        if read.get("schema", 1) == 1:
+            read = _with_places(read)
+        if read["schema"] != STATE_SCHEMA:
+            raise DataError(f"loop.json: schema = {read['schema']}, expected {STATE_SCHEMA}")
+        return msgspec.convert(read, LoopState)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"loop.json: {error}") from error
-    if state.schema != STATE_SCHEMA:
-        raise DataError(f"loop.json: schema = {state.schema}, expected {STATE_SCHEMA}")
-    return state
+
+
+def _with_places(read: dict[str, Any]) -> dict[str, Any]:
+    """Return a state of version 1 in the present form: its only place holds whatever is in shadow."""
+    parts = {name: read.pop(name, None) for name in ("shadow", "phase", "comparison", "verdict", "other_error")}
+    read |= {"schema": STATE_SCHEMA, "places": 1}
+    if parts["shadow"] is not None:
+        read["found"] = parts["shadow"] | {
+            "is_proposed": parts["phase"] == "proposed",
+            "comparison": parts["comparison"],
+            "verdict": parts["verdict"],
+            "error": parts["other_error"],
+        }
+    return read

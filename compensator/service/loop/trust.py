@@ -5,7 +5,7 @@ held by hand or by an internal error.
 
 A residual alarm does not say whether a sensor or the model is wrong: to a check that knows one model, most effects that
 the model lacks look like a sensor that drifts. It is a reason to diagnose, which tells the two apart. Beside a shadow,
-a sensor counts as suspected only if it is under both models: a fault of a sensor stays under the other model, an effect
+a sensor counts as suspected only if it is under every model: a fault of a sensor stays under all of them, an effect
 that only one of them has does not.
 """
 
@@ -43,9 +43,8 @@ def is_alarmed(reasons: Sequence[str]) -> bool:
     return any(reason.startswith(_ALARMS) for reason in reasons)
 
 
-def both_suspect_a_sensor(present: Outcome, other: Outcome) -> bool:
-    """Return whether a sensor, and not the model, is suspected under both models."""
+def all_suspect_a_sensor(outcomes: Sequence[Outcome]) -> bool:
+    """Return whether a sensor, and not the model, is suspected under every model that processed a sample."""
     return all(
-        sensor_suspected(one.offset.reasons) or Reason.RESIDUAL_TOO_LARGE in one.offset.reasons
-        for one in (present, other)
+        sensor_suspected(one.offset.reasons) or Reason.RESIDUAL_TOO_LARGE in one.offset.reasons for one in outcomes
     )

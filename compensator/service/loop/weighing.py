@@ -8,7 +8,7 @@ itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +64,7 @@ class Weighed:
 
 
 def weigh(
-    found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel, shadow: ThermalModel | None
+    found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel, in_shadow: Collection[str]
 ) -> Weighed:
     """Return the candidate that follows from a diagnosis, checked, and its differences.
 
@@ -76,8 +76,10 @@ def weigh(
         Settings of the service.
     calibrated : bytes
         Model file of the configuration, or the last that a person adopted.
-    present, shadow : ThermalModel
-        The present model, and the one in shadow.
+    present : ThermalModel
+        The present model.
+    in_shadow : collection of str
+        Hashes of the models in shadow.
     """
     base = model_of(config, calibrated, source="calibrated model")
     data = found.model if found.verdict in _EXPLAINING and found.effects else None
@@ -91,7 +93,6 @@ def weigh(
     except CompensatorError as error:
         return Weighed(replace(plain, refused=str(error)), None)
     same, change = difference(model, present)
-    in_shadow = shadow is not None and model.sha256 == shadow.sha256
     effects = effect_names(model)
     if same and model.sha256 == base.sha256:
         change = 0.0
@@ -102,7 +103,7 @@ def weigh(
         candidate=model.name,
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
-        in_shadow=in_shadow,
+        in_shadow=model.sha256 in in_shadow,
         calibrated=model.sha256 == base.sha256,
     )
     return Weighed(weighed, data)

@@ -28,6 +28,6 @@ def nothing_follows(why: str, found: DiagnosisData) -> str:
         "unchanged": f"the diagnosis finds what the model has: {effects}",
         "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
         "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
-        "waits": f"{effects}: waits while the model before the last change is compared; looked for again later",
+        "waits": f"{effects}: waits while another model takes over or is compared; looked for again later",
     }
     return words[why].rstrip("; ")

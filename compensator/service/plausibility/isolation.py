@@ -148,7 +148,7 @@ class FaultIsolation:
 
     def _response(self, t_q_k: float, at_k: float, *, ramp: bool) -> tuple[float, ...]:
         """Return the effect of a sensor fault on the residual, µm by block: minus its effect on the prediction."""
-        engine = Engine(dataclasses.replace(self._model, effects=()))
+        engine = Engine(dataclasses.replace(self._model, effects=(), parts=(), outputs=()))
         engine.set_reference(0.0, 0.0)
         for _ in range(_SETTLING):
             engine.step(0.0, 0.0)

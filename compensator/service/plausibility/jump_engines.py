@@ -133,6 +133,8 @@ class JumpEngines:
                 most = max((1 + unsure) * change_k[name], NEAR * std)
                 if is_back:
                     values[name] = value
+                elif name in jumped and not state.is_suspect:
+                    new.append(name)
                 elif state.again >= _UNSTEADY:
                     values[name] = NAN
                 elif abs(difference - shift) <= most or not state.is_suspect:
@@ -146,7 +148,9 @@ class JumpEngines:
                 values[name] = value
             if name in new:
                 state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
-                state.first_k.setdefault(name, difference)
+                # What goes on to move while it is only watched is one jump; a suspect channel has jumped again.
+                first_k = state.first_k.get(name, difference)
+                state.first_k[name] = first_k if state.is_suspect else difference
         return Fed(values, new)
 
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
@@ -190,6 +194,15 @@ class JumpEngines:
         """Difference of their predictions, µm; 0 before the first sample."""
         believing, shifted = self.believing.estimate, self.shifted.estimate
         return abs(believing.y_um - shifted.y_um) if believing is not None and shifted is not None else 0.0
+
+    @property
+    def outputs_apart(self) -> tuple[float, ...]:
+        """Difference of their predictions of each further output, in its unit; empty before the first sample."""
+        believing, shifted = self.believing.estimate, self.shifted.estimate
+        if believing is None or shifted is None:
+            return ()
+        pairs = zip(believing.outputs, shifted.outputs, strict=True)
+        return tuple(abs(one.value - other.value) for one, other in pairs)
 
 
 def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:

@@ -16,8 +16,9 @@ The channel is accepted again if
 - an operator says so: `resume` believes it, a zero keeps the state and gives the sensor its new zero.
 
 A jump within `rate_max_per_min` is used at first; with `jump_min_k` both engines run for some samples, unless heat
-within its range of validity explains a jump of T_Q. Where the shifted one expects them far better, the channel becomes
-suspect and the state that of the shifted engine: what the wrong values did is undone.
+within its range of validity explains a jump of T_Q. A channel that goes on to move like that is still in the same
+jump, which takes some samples. Where the shifted one expects them far better, the channel becomes suspect and the state
+that of the shifted engine: what the wrong values did is undone.
 
 A jump may also hide in samples without the channel: its couple was open, or the service was stopped. With `jump_min_k`
 a channel that then reads otherwise than expected is *unconfirmed*: heat or air that changed meanwhile looks the same.
@@ -116,6 +117,14 @@ class JumpWatch:
         return f"jumps of T_Q and AT beyond rate_max_per_min, and from {self._signs.least_k:g} K on"
 
     # ------------------------------------------------------------------ state
+
+    @property
+    def doubts(self) -> tuple[float, ...]:
+        """As `doubt_um`, of each further output in its unit; empty where no channel is unconfirmed."""
+        engines = self._engines
+        if engines is None or not self._state.is_unconfirmed:
+            return ()
+        return tuple(apart / math.sqrt(2.0) for apart in engines.outputs_apart)
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -240,6 +249,8 @@ class JumpWatch:
             jumped = [*hidden, *(name for name in self._signs.watchable(engine, offered) if name not in hidden)]
             if jumped:
                 self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
+        elif self._engines is not None and self._signs is not None and not self.suspects and not self.unconfirmed:
+            jumped = self._going_on(self._signs, self._engines, offered)
         engines = self._engines
         if engines is None:
             return Judgement()
@@ -301,6 +312,12 @@ class JumpWatch:
         """Use the channels no longer that were watched or unconfirmed."""
         self._state.is_suspect, self._state.is_unconfirmed = True, False
         self._state.start_evidence()
+
+    def _going_on(self, signs: JumpSigns, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
+        """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
+        shifts = self._state.shifts_k
+        less = {name: value - shifts.get(name, 0.0) for name, value in offered.items()}
+        return [name for name in signs.watchable(engines.shifted.engine, less) if name in shifts]
 
     def _seen_again(self, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that are seen again after samples without them, and count such samples."""

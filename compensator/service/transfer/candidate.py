@@ -150,7 +150,8 @@ class RecordedRun:
         #: The zero with the newest sample; None before the first.
         self.zero: Zero | None = None
         self._free = FreeRun(compensation)
-        self._names = {channel.name for channel in config.channel}
+        #: Names of the channels that it processes.
+        self.channels = frozenset(channel.name for channel in config.channel)
         self._probes = probes
         self._first_ns = 0
 
@@ -175,7 +176,7 @@ class RecordedRun:
         if step.sample is not None:
             if step.zero is not None:
                 self.compensation.zero(step.zero)
-            channels = {name: channel for name, channel in step.sample.channels.items() if name in self._names}
+            channels = {name: channel for name, channel in step.sample.channels.items() if name in self.channels}
             # The zero is set above; of the other events only the pauses concern another model, and that a person has
             # seen to exchanged couples: it must not wait for this again.
             if self.compensation.plausibility.exchanged and any(map(_is_resume, step.events)):
@@ -298,4 +299,4 @@ def _opening_zero(path: Path) -> Zero | None:
         state = decode_state(opening_of(path).get("state.json", b""))
     except DataError:
         return None
-    return Zero.of_references(state.engine.reference, state.zero)
+    return Zero.of_references(state.engine.reference, state.zero, state.axes or {})

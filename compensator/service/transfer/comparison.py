@@ -1,4 +1,4 @@
-"""Two models compared on measured Y, sample by sample: for the second opinion, and for a shadow.
+"""Two models compared on measured Y or another axis, sample by sample: for the second opinion, and for a shadow.
 
 Compared are block means of a displacement sensor, as changes from one block to the next, or what each probe showed
 beyond the prediction before it. `evidence` says how strongly they speak for one of the models.
@@ -14,14 +14,16 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.axes import FIRST
 from compensator.clock import NS
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.messages import number
+from compensator.messages_axes import AxesEstimate
 from compensator.service.outcome import Outcome
 from compensator.service.probing import UNKNOWN_UM
 from compensator.service.transfer.evidence import evidence, followed
 
-#: From this number of standard deviations of the difference on a model is better or worse.
+#: From this number of standard deviations on one of the models is refuted: by the likelihood (`evidence`).
 DEVIATIONS = 4.0
 #: A model that refutes the other one must be better than one that is neither better nor worse by this part of them.
 SURE_PART = 0.5
@@ -113,13 +115,13 @@ class Comparison:
         Length of a sample, s.
     state : ComparisonState, optional
         What was compared before.
-    by_likelihood : bool
-        Whether the deviations are those of the likelihood (`evidence`).
+    axis : str
+        The axis whose measured values count; probes are of Y.
     """
 
-    def __init__(self, period_s: float, state: ComparisonState | None = None, *, by_likelihood: bool = False) -> None:
-        self._by_likelihood = by_likelihood
+    def __init__(self, period_s: float, state: ComparisonState | None = None, *, axis: str = FIRST) -> None:
         self._fewest = _MEASURED * BLOCK_MIN * 60.0 / period_s
+        self._axis = axis
         self.state = state if state is not None else ComparisonState()
 
     def add(self, present: Outcome, candidate: Outcome, *, suspected: bool) -> bool:
@@ -132,11 +134,13 @@ class Comparison:
         suspected : bool
             Whether a sensor is suspected: the sample is counted, but not compared.
         """
-        residuals = number(present.estimate.residual_um), number(candidate.estimate.residual_um)
+        (own_um, measured_um), (other_um, _) = (_measured(one, self._axis) for one in (present, candidate))
+        residuals = own_um, other_um
         probes = [
             (number(own.innovation_um), number(other.innovation_um))
             for own, other in zip(present.probes, candidate.probes, strict=True)
-            if (own.taken or other.taken)
+            if self._axis == FIRST
+            and (own.taken or other.taken)
             and max(number(own.innovation_std_um), number(other.innovation_std_um)) < UNKNOWN_UM
         ]
         state, is_measured, now_ns = self.state, math.isfinite(sum(residuals)), present.sample.time_utc_ns
@@ -148,9 +152,7 @@ class Comparison:
         state.first_ns = state.first_ns or now_ns - round(present.sample.period_s * NS)
         state.last_ns = now_ns
         state.probes += [ComparedProbe(now_ns, *pair) for pair in probes]
-        return (
-            self._add_measured(*residuals, number(present.estimate.y_um), now_ns) if is_measured else False
-        ) or bool(probes)
+        return (self._add_measured(*residuals, measured_um, now_ns) if is_measured else False) or bool(probes)
 
     def set_zero(self) -> None:
         """Begin a new block: Y before and after a zero are not comparable."""
@@ -197,7 +199,7 @@ class Comparison:
         Parameters
         ----------
         deviations : float
-            From this number of standard deviations of the difference on a model is better or worse.
+            From this number of standard deviations on one of the models is refuted (`evidence`).
         """
         by_sensor = self._by_sensor(deviations)
         chosen = by_sensor if by_sensor.why is None or not self.state.probes else self._by_probes(deviations)
@@ -283,9 +285,8 @@ class Comparison:
 
     def _judged(self, scores: ComparisonData, own: Vector, difference: Vector, deviations: float) -> ComparisonData:
         weighed = evidence(own, difference)
-        shown = weighed.likelihood if self._by_likelihood else weighed.deviations
-        # What refutes the present model may still be no better than it: by half as many deviations it must be.
-        also = SURE_PART * deviations if self._by_likelihood else deviations
+        # What refutes a model may still be no better than it: by half as many deviations it must be.
+        shown, also = weighed.likelihood, SURE_PART * deviations
         assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
         verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
         if shown >= deviations and weighed.deviations >= also and weighed.ratio < 1.0:
@@ -305,6 +306,18 @@ def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:
 def changed(found: ComparisonData, **changes: object) -> ComparisonData:
     """Return a comparison with some of its data replaced."""
     return msgspec.structs.replace(found, **changes)
+
+
+def _measured(outcome: Outcome, axis: str) -> tuple[float, float]:
+    """Return residual and measured deformation of an axis, µm; NaN where it was not measured."""
+    estimate = outcome.estimate
+    if axis == FIRST:
+        return number(estimate.residual_um), number(estimate.y_um)
+    assert isinstance(estimate, AxesEstimate)
+    residual, measured = (estimate.axes[f"{axis}_{name}"] for name in ("residual_um", "um"))
+    assert not isinstance(residual, list)
+    assert not isinstance(measured, list)
+    return number(residual), number(measured)
 
 
 def _about_zero(blocks: list[Block], fewest: float) -> tuple[float, float]:

@@ -17,9 +17,8 @@ from compensator.atomic_write import replace_file
 from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError, ServiceError
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
-from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.compensation import Compensation
+from compensator.service.compensation import Compensation, model_of
 
 _FILE = "adopted.json"
 
@@ -160,13 +159,12 @@ def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
     ModelError
         If the file, its dynamics, a channel that it needs, or its period is wrong; the message is one line.
     """
-    model = parse_model(data, source=source)
     try:
-        if config.model.alternative:
-            model = model.with_alternative(config.model.alternative)
+        model = model_of(config, data, source=source)
         Compensation(config, model)
     except CompensatorError as error:
-        raise ModelError(f"{source}: {error}") from error
+        text = str(error)
+        raise ModelError(text if text.startswith(f"{source}: ") else f"{source}: {text}") from error
     polls = model.period_s / config.sampling.poll_interval_s
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
         raise ModelError(

@@ -8,6 +8,7 @@ configuration or the model has changed since, a new compensation is warmed up on
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -39,10 +40,10 @@ class Resumed:
         """Add an event."""
         self.notes.append(Note(EventKind.RESTART, text, data))
 
-    def continue_from(self, offset_um: float) -> None:
-        """Continue from another offset than the compensation's own, µm."""
+    def continue_from(self, offset_um: float, further: Mapping[str, float]) -> None:
+        """Continue from other offsets than the compensation's own: that of Y, µm, and further outputs by name."""
         own = self.compensation.status.handover
-        self.compensation.continue_from(replace(own, offset_um=offset_um, probing=None))
+        self.compensation.continue_from(replace(own, offset_um=offset_um, further=further, probing=None))
 
 
 @dataclass(slots=True)
@@ -67,6 +68,7 @@ class _LastFile:
             offset_um=state.offset_um,
             operator_hold=state.memory.operator_hold,
             internal_error=state.memory.internal_error,
+            further={name: one.offset for name, one in (state.axes or {}).items()},
         )
 
     def add(self, step: RecordedStep) -> float:
@@ -81,10 +83,12 @@ class _LastFile:
         published = number(offset.y_offset_um) if offset is not None else math.nan
         # Without a state only the offsets show a hold from an earlier file.
         reasons = offset.reasons if offset is not None else []
+        further = {name: value for name, value in step.further.items() if not math.isnan(value)}
         self.handover = Handover(
             offset_um=offset_um if math.isnan(published) else published,
             operator_hold=held or Reason.OPERATOR_HOLD in reasons,
             internal_error=failed or Reason.INTERNAL_ERROR in reasons,
+            further={**self.handover.further, **further},
         )
         return published
 
@@ -108,7 +112,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: Checkpointed
     """
     resumed = _from_disk(loaded, model)
     if checkpointed is not None and checkpointed.seq > resumed.compensation.status.seq:
-        resumed.continue_from(checkpointed.y_offset_um)
+        resumed.continue_from(checkpointed.y_offset_um, checkpointed.further)
         resumed.note(
             f"continues from the offset {checkpointed.y_offset_um:.3f} µm of sample {checkpointed.seq}, "
             "which was published while the disk failed",
@@ -197,7 +201,7 @@ def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, dif
     resumed.compensation = compensation
     if last.samples:
         # The offset of a torn last sample was computed but not published.
-        resumed.continue_from(last.handover.offset_um)
+        resumed.continue_from(last.handover.offset_um, last.handover.further)
     status = compensation.status
     resumed.note(
         f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {status.seq}",

@@ -1,7 +1,7 @@
-"""Second opinion before another model takes over: both models on the measured Y on record.
+"""Second opinion before another model takes over: both models on the measured Y on record, and every other axis.
 
 Both run through the same replay of the recordings as a warm-up, about the zeros of the record, with the probes of the
-record. Compared are the last `COMPARED_H` hours (`comparison`).
+record. Compared are the last `COMPARED_H` hours (`comparison`), each axis that is measured by its own values.
 
 Left out: samples before the state of both models is known, without T_Q or AT, while the service suspected a sensor and
 not the model, blocks of a sensor that does not change at all, and probes that both models refuse.
@@ -10,10 +10,11 @@ not the model, blocks of a sensor that does not change at all, and probes that b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from compensator.axes import FIRST, AxisWords, label_of
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Config
@@ -28,6 +29,7 @@ from compensator.service.transfer.comparison import BLOCK_MIN, FEWEST, Compariso
 
 #: How much of the record is compared, h.
 COMPARED_H = 24.0
+_Y_SUSPECTED = f"{Reason.IMPLAUSIBLE}:y_um"
 _UNUSABLE = (Reason.COLD_START, Reason.T_Q_MISSING, Reason.AT_MISSING, Reason.T_Q_AT_EXCHANGED)
 
 
@@ -57,32 +59,47 @@ def second_opinion(
         compared_ns = round(COMPARED_H * 3600 * NS)
         window = window_of(folder, config.machine.name, slowest, between_samples, compared_ns=compared_ns)
         runs = [RecordedRun(config, Compensation(config, model), probes=True) for model in (present, candidate)]
-        found, move_um = _run(runs, window, window.end_ns - compared_ns, between_samples)
+        found, moves_um = _run(runs, window, window.end_ns - compared_ns, between_samples)
     except (CompensatorError, OSError) as error:
         return not_judged(NotJudged.NO_RECORD, remark=str(error))
-    first_ns = found.state.first_ns
-    hours = (window.end_ns - first_ns) / (3600 * NS) if first_ns else 0.0
-    move = None if math.isnan(move_um) else move_um
-    return changed(found.verdict(), hours=hours, ratio=None, offset_change_um=move)
+    verdicts = {}
+    for axis, comparison in found.items():
+        first_ns = comparison.state.first_ns
+        hours = (window.end_ns - first_ns) / (3600 * NS) if first_ns else 0.0
+        verdicts[axis] = changed(comparison.verdict(), hours=hours, ratio=None, offset_change_um=moves_um.get(axis))
+    own = verdicts.pop(FIRST)
+    return changed(own, axes=verdicts)
 
 
 def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) -> None:
-    """Refuse a model that is clearly worse, unless it is forced.
+    """Refuse a model that is clearly worse on an axis, unless it is forced.
 
     Raises
     ------
     ServiceError
         With the figures and what to do.
     """
-    if found.verdict == ComparisonVerdict.WORSE and not force:
-        raise ServiceError(
-            f"model {model.name} ({model.sha256[:12]}) is clearly worse: {described(found)}; "
-            "check that it is a model of this machine and that measured Y is right, or use --force"
-        )
+    worse = {axis: one for axis, one in found.by_axis().items() if one.verdict == ComparisonVerdict.WORSE}
+    if not worse or force:
+        return
+    names = " and ".join(map(label_of, worse))
+    said = _of_axes(worse).partition(": ")[2] if len(worse) == 1 else _of_axes(worse)
+    raise ServiceError(
+        f"model {model.name} ({model.sha256[:12]}) is clearly worse{f' on {names}' if found.axes else ''}: {said}; "
+        f"check that it is a model of this machine and that measured {names} is right, or use --force"
+    )
 
 
 def described(found: ComparisonData) -> str:
     """Return a comparison in words."""
+    return _of_axes(found.by_axis()) if found.axes else _described(found)
+
+
+def _of_axes(found: Mapping[str, ComparisonData]) -> str:
+    return ". ".join(f"{label_of(axis)}: {AxisWords(axis)(_described(one))}" for axis, one in found.items())
+
+
+def _described(found: ComparisonData) -> str:
     move = found.offset_change_um
     moves = f"the offset would move by {round(move, 1) + 0.0:+.1f} µm" if move is not None else ""
     if found.present_rms_um is None or found.candidate_rms_um is None:
@@ -98,7 +115,8 @@ def described(found: ComparisonData) -> str:
         text += " (no clear difference)"
     else:
         moved = "measured Y has moved by itself; by its changes, this one is " if found.y_moved else ""
-        text += f" ({moved}{found.verdict} by {abs(found.deviations):.0f} standard deviations of the difference)"
+        refuted = "the present one" if found.verdict == ComparisonVerdict.BETTER else "it"
+        text += f" ({moved}{found.verdict}: {refuted} is refuted by {abs(found.deviations):.0f} standard deviations)"
     return "; ".join(filter(None, (text, moves)))
 
 
@@ -122,10 +140,11 @@ def _why(found: ComparisonData) -> str:
 
 def _run(
     runs: Sequence[RecordedRun], window: Window, from_ns: int, between_samples: Callable[[], None]
-) -> tuple[Comparison, float]:
-    """Run both models through the record; return also by how much the offset would move, µm."""
+) -> tuple[dict[str, Comparison], dict[str, float]]:
+    """Run both models through the record, each axis by itself; return also by how much its offset would move, µm."""
     models = [run.compensation.model for run in runs]
-    found = Comparison(models[0].period_s)
+    axes = (FIRST, *(one.axis for one in runs[0].compensation.outputs.planned if one.column in runs[0].channels))
+    found = {axis: Comparison(models[0].period_s, axis=axis) for axis in axes}
     begun = window.at_rest is not None
     for run in runs:
         run.compensation.begin(None)
@@ -145,14 +164,17 @@ def _run(
             for run in runs:
                 run.compensation.begin(zero)
         if step.zero is not None:
-            found.set_zero()
+            for comparison in found.values():
+                comparison.set_zero()
         outcomes = [outcome for run in runs if (outcome := run.process(step)) is not None]
         if len(outcomes) == len(runs) and outcomes[0].sample.time_utc_ns > from_ns:
             _compare(found, step, outcomes[0], outcomes[1])
     present, candidate = (run.compensation for run in runs)
     # As at the exchange: with probes the corrected deformation stays as it is.
     candidate.continue_from(replace(present.status.handover, model_changed=True))
-    return found, candidate.status.target_um - present.status.target_um
+    before, after = ({FIRST: one.status.target_um, **one.further_targets} for one in (present, candidate))
+    moves = {axis: after[axis] - before[axis] for axis in axes}
+    return found, {axis: move for axis, move in moves.items() if not math.isnan(move)}
 
 
 def _steps(window: Window, between_samples: Callable[[], None]) -> Iterator[RecordedStep]:
@@ -167,12 +189,15 @@ def _recorded_zero(step: RecordedStep) -> Zero | None:
     return Zero.set_in(step.estimate) if step.sample is not None else None
 
 
-def _compare(found: Comparison, step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
+def _compare(found: Mapping[str, Comparison], step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
     """Add one sample and its probes."""
-    if not is_unusable(present, candidate):
-        found.add(
-            present, candidate, suspected=sensor_suspected(step.offset.reasons if step.offset is not None else ())
-        )
+    if is_unusable(present, candidate):
+        return
+    reasons = step.offset.reasons if step.offset is not None else ()
+    for axis, comparison in found.items():
+        # The sensor of Y says nothing of the other axes; suspected temperatures are those of all.
+        concerned = reasons if axis == FIRST else [one for one in reasons if one != _Y_SUSPECTED]
+        comparison.add(present, candidate, suspected=sensor_suspected(concerned))
 
 
 def is_unusable(*outcomes: Outcome) -> bool:

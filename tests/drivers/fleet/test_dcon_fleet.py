@@ -221,6 +221,7 @@ async def test_dead_module_does_not_starve_the_others(rig: Any, monkeypatch: pyt
 
 
 async def test_adapter_unplugged_and_back(rig: Any) -> None:
+    threads = threading.active_count()
     _, end, [device] = made(rig, {1: Module(NEW)}, table())
     await device.read()
     end.stop()
@@ -229,7 +230,8 @@ async def test_adapter_unplugged_and_back(rig: Any) -> None:
             await device.read()
     end.start()
     assert (await device.read())[0].value == 22.22
-    assert threading.active_count() == 1
+    # Those of other tests may end meanwhile.
+    assert threading.active_count() <= threads
 
 
 async def test_adapter_unplugged_during_a_command(rig: Any) -> None:

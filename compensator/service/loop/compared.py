@@ -1,0 +1,107 @@
+"""One place beside the present model: what is compared, whether the other model is better, and at which level."""
+
+from __future__ import annotations
+
+from compensator.clock import NS
+from compensator.codes import Reason
+from compensator.config import Loop as LoopSettings
+from compensator.events import EventKind
+from compensator.service.loop.level import ErrorBlocks, level_um
+from compensator.service.loop.place import remembered_h
+from compensator.service.loop.proof import (
+    BETTER_PART,
+    LEVEL_PART,
+    is_better_about_zero,
+    is_clearly_better,
+    is_enough,
+)
+from compensator.service.loop.state import Place
+from compensator.service.loop.trust import is_disturbed
+from compensator.service.outcome import Outcome
+from compensator.service.transfer.comparison import Comparison
+from compensator.service.transfer.second_opinion import is_unusable
+
+_HOUR_NS = 3600 * NS
+
+
+class Compared:
+    """The model of a place and the present one.
+
+    Parameters
+    ----------
+    place : Place
+        The place; its comparison and verdict are kept up to date.
+    settings : config.Loop
+        `[loop]`.
+    period_s : float
+        Length of a sample, s.
+    present_error : ErrorBlocks
+        Errors of the present model.
+    """
+
+    def __init__(self, place: Place, settings: LoopSettings, period_s: float, present_error: ErrorBlocks) -> None:
+        self._place, self._settings, self._present_error = place, settings, present_error
+        self._comparison = Comparison(period_s, place.comparison)
+
+    @property
+    def judged_h(self) -> float:
+        """Time of the usable blocks of measured Y, h."""
+        return self._comparison.judged_h
+
+    def add(self, present: Outcome, other: Outcome) -> bool:
+        """Add a sample, unless it must not judge; return whether the verdict was made anew."""
+        self._place.error.update(other)
+        found = self._comparison
+        if any(note.kind == EventKind.ZERO for note in present.notes):
+            found.set_zero()
+        reasons = [*present.offset.reasons, *other.offset.reasons]
+        missing = any(reason.startswith(Reason.CHANNEL_MISSING) for reason in reasons)
+        if missing or is_unusable(present, other) or is_disturbed(reasons):
+            return False
+        if not found.add(present, other, suspected=False):
+            return False
+        hours = remembered_h(self._settings, self._place.role)
+        oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
+        found.forget_before(oldest_ns, 2 * self._settings.probes)
+        self._place.verdict = found.verdict(deviations=self._settings.deviations)
+        return True
+
+    def add_suspected(self, other: Outcome) -> None:
+        """Begin anew: before a sensor is suspected it has been wrong for a while."""
+        self._place.error.update(other)
+        if self._place.comparison.first_ns:
+            self._place.begin_anew()
+
+    def is_better(self, now_ns: int) -> bool:
+        """Return whether a candidate has shown enough, and in its own hours, too."""
+        place = self._place
+        compared_h = (now_ns - place.since_utc_ns) / _HOUR_NS
+        found = is_clearly_better(place.verdict) and is_enough(
+            place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
+        )
+        return found and (not place.comparison.model_ns or self._comparison.is_itself_better())
+
+    @property
+    def shown_level_um(self) -> float | None:
+        """The level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
+        since_ns = self._place.since_utc_ns
+        return level_um(self._present_error.blocks, self._place.error.blocks, since_ns=since_ns)
+
+    @property
+    def level_um(self) -> float | None:
+        """By how much a candidate's level is raised at its adoption, µm; None if its level is not known.
+
+        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
+        that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
+        which of them is seen at the next zero.
+        """
+        shown_um, verdict = self.shown_level_um, self._place.verdict
+        part = BETTER_PART if verdict.measured_by == "probe" else LEVEL_PART
+        if shown_um is None and is_better_about_zero(verdict, part):
+            return self._comparison.level_um if verdict.y_moved else 0.0
+        return shown_um
+
+    @property
+    def unknown_level_um(self) -> float:
+        """By how much it is raised where its level is not known, µm: only its changes are new."""
+        return self._comparison.level_um if self._place.verdict.y_moved else 0.0

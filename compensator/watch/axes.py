@@ -1,0 +1,63 @@
+"""The axes of a machine that has several, in the views."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from msgspec import UNSET
+
+from compensator.axes import FIRST, label_of
+from compensator.codes import worst_state
+from compensator.messages import Offset
+from compensator.messages_axes import SHOWN_UNITS, UNITS, AxisOffset
+
+
+def worst(offset: Offset, axes: Mapping[str, AxisOffset]) -> tuple[str, list[str]]:
+    """Return the worst state of all axes of a sample, and the reasons of all, each once.
+
+    Parameters
+    ----------
+    offset : Offset
+        Of Y.
+    axes : mapping of str to AxisOffset
+        Those of further axes that were received last; of another sample they do not count.
+    """
+    same = [one for one in axes.values() if one.seq == offset.seq and one.machine == offset.machine]
+    state = worst_state(one.state for one in (offset, *same))
+    return state, list(dict.fromkeys(reason for one in (offset, *same) for reason in one.reasons))
+
+
+def axis_snapshot(offset: AxisOffset, axes: Mapping[str, AxisOffset], *, silent: bool) -> list[dict[str, Any]]:
+    """Return the present values of every axis; an axis whose message of this sample is missing has none.
+
+    Parameters
+    ----------
+    offset : AxisOffset
+        Of Y.
+    axes : mapping of str to AxisOffset
+        Those of further axes.
+    silent : bool
+        Whether the last offset is out of date; then there is no rate.
+    """
+    found = []
+    for axis in offset.axes:
+        if axis not in UNITS:
+            continue
+        message = offset if axis == FIRST else axes.get(axis)
+        if message is not None and (message.seq, message.machine) != (offset.seq, offset.machine):
+            message = None
+        entry: dict[str, Any] = {
+            "axis": axis,
+            "label": label_of(axis).upper(),
+            "unit": SHOWN_UNITS[UNITS[axis]],
+            "offset": message.y_offset_um if message is not None else None,
+            "rate_per_min": message.y_offset_rate_um_per_min if message is not None and not silent else None,
+            "std": message.y_offset_std_um if message is not None else None,
+            "state": message.state if message is not None else None,
+            "reasons": list(message.reasons) if message is not None else [],
+        }
+        if message is not None and message.y_slope_um_per_m is not UNSET:
+            entry["slope_um_per_m"] = message.y_slope_um_per_m
+        found.append(entry)
+    return found
