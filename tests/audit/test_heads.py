@@ -52,6 +52,7 @@ def kinds(found: Audit) -> set[str]:
 
 
 def remarks_of(service: Service) -> list[str]:
+    service.recorder._finisher.wait()  # it works in the background
     return [str(data["code"]) for _, data in service.recorder.remarks()]
 
 
