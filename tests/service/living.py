@@ -6,6 +6,7 @@ import asyncio
 import functools
 import math
 import shutil
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -35,8 +36,10 @@ from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 
 MACHINE = "vmc-07"
-#: Real seconds that a sample takes at least while the service works on a command.
+#: Processor time that the thread of a command gets in each sample, s; the clock would give it less on a busy computer.
 PATIENCE_S = 0.02
+#: Real seconds of a sample after which that thread is not working, but waiting for the next sample.
+IDLE_S = 0.4
 
 
 def settings(**changes: Any) -> Config:
@@ -69,14 +72,19 @@ class Machine:
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
-            patience_s = PATIENCE_S * self.config.sampling.poll_interval_s / 60.0
-            self.promised = [promise for promise in self.promised if not promise.done()]
-            if self.promised:
-                await asyncio.sleep(patience_s)
+            part = self.config.sampling.poll_interval_s / 60.0
+            worked_s, idle_s = time.process_time() + PATIENCE_S * part, time.monotonic() + IDLE_S * part
+            while self.is_promised and time.process_time() < worked_s and time.monotonic() < idle_s:
+                await asyncio.sleep(0.002)
             while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
-                await asyncio.sleep(patience_s)
+                await asyncio.sleep(0.002)
 
         self.clock = VirtualClock(start_ns, advance)
+
+    @property
+    def is_promised(self) -> bool:
+        self.promised = [promise for promise in self.promised if not promise.done()]
+        return bool(self.promised)
 
     @property
     def recordings(self) -> Path:
