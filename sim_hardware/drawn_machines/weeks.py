@@ -322,7 +322,7 @@ def _weeks(first_seed: int, count: int) -> tuple[Week, ...]:
 
 #: To develop on, as often as is useful.
 DEVELOPMENT_WEEKS = _weeks(3000, 100)
-#: Run at most once; no single week of it is examined before.
+#: Each week is run at most once, and none is examined before.
 SEALED_WEEKS = _weeks(880_000, 100)
-#: Each run of SEALED_WEEKS: date, version, how many, where its figures are.
-SEALED_WEEK_RUNS: tuple[str, ...] = ()
+#: Each run of some SEALED_WEEKS: their seeds, and date, version, where its figures are.
+SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = ()

@@ -371,13 +371,15 @@ def main(words):
     parser.add_argument("--resume", action="store_true", help="leave out what is in that file")
     parser.add_argument("--workers", type=int)
     asked = parser.parse_args(words)
+    part, parts = (int(word) for word in asked.part.split("/"))
+    cases = [case for case in SETS[asked.set] if asked.seed in (None, case.seed)][part - 1 :: parts]
     if asked.set == "sealed":
         if asked.seed is not None:
             parser.error("no single week of the sealed set is run")
-        if SEALED_WEEK_RUNS:
-            parser.error(f"the sealed set has been run: {SEALED_WEEK_RUNS[0]}")
-        sys.stdout.write("Enter this run in SEALED_WEEK_RUNS of sim_hardware/drawn_machines/weeks.py.\n")
-    part, parts = (int(word) for word in asked.part.split("/"))
-    cases = [case for case in SETS[asked.set] if asked.seed in (None, case.seed)][part - 1 :: parts]
+        seeds = [case.seed for case in cases]
+        for run_before, when in SEALED_WEEK_RUNS:
+            if set(run_before) & set(seeds):
+                parser.error(f"some of these sealed weeks have been run: {when}")
+        sys.stdout.write(f"Enter {seeds} in SEALED_WEEK_RUNS of sim_hardware/drawn_machines/weeks.py.\n")
     out = asked.out or Path(f"loop-{asked.set}.json")
     list(report(cases, out, workers=asked.workers, resume=asked.resume))
