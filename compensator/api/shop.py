@@ -35,6 +35,8 @@ NOW_H = 24.0
 #: Most decisions that are kept.
 MOST_STEPS = 500
 _KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
+#: After these there is no proposal: withdrawn, adopted or ended; another one is compared, or all begins anew.
+_NOT_PROPOSED = (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END, LoopAction.SHADOW, LoopAction.BACK)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,7 +194,7 @@ class _Summary:
             self._found = effects
         if step == LoopAction.PROPOSE:
             self._proposed = effects
-        elif step in (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END):
+        elif step in _NOT_PROPOSED and not (step == LoopAction.END and data.get("role") == "before"):
             self._proposed = ()
         if step in (LoopAction.ADOPT, LoopAction.BACK):
             self._effects = effects

@@ -94,6 +94,8 @@ class MachineWeek:
         and troubles, but without any effect.
     true_um, healthy_um : array, shape (n,)
         The machine's displacement, and without any effect.
+    alone : tuple of (dict of str to array, array)
+        For each spell what is read, and the displacement, if no other effect acts; with the same noise and troubles.
     running : array of bool, shape (n,)
         Whether the service runs.
     spells : tuple of Spell
@@ -118,6 +120,7 @@ class MachineWeek:
     healthy: dict[str, Array]
     true_um: Array
     healthy_um: Array
+    alone: tuple[tuple[dict[str, Array], Array], ...]
     running: Mask
     spells: tuple[Spell, ...]
     troubles: tuple[Trouble, ...]
@@ -192,10 +195,11 @@ class _Draw(Draw):
         calibration = self._within(self._run(self.calibration_duty, 0.0), "calibration")
         if not RISE_K[0] <= float(np.ptp(calibration.t_q_degc - calibration.at_degc)) <= RISE_K[1]:
             raise UnfairError("T_Q rises too little or too much")
-        spells, response = [], healthy
+        spells, responses, response = [], [], healthy
         for effect, (begin, end) in zip(week.effects, self._times(), strict=False):
             spell, acted = self._acted(effect, healthy, begin, end)
             spells.append(spell)
+            responses.append(acted)
             # Small effects add up; heat that two of them share is neglected.
             response = Response(
                 **{
@@ -219,6 +223,7 @@ class _Draw(Draw):
             healthy=self._read(healthy, troubles),
             true_um=response.y_um,
             healthy_um=healthy.y_um,
+            alone=tuple((self._read(acted, troubles), acted.y_um) for acted in responses),
             running=running,
             spells=tuple(spells),
             troubles=troubles,
@@ -317,7 +322,7 @@ def _weeks(first_seed: int, count: int) -> tuple[Week, ...]:
 
 #: To develop on, as often as is useful.
 DEVELOPMENT_WEEKS = _weeks(3000, 100)
-#: Run at most once; no single week of it is examined before.
+#: Each week is run at most once, and none is examined before.
 SEALED_WEEKS = _weeks(880_000, 100)
-#: Each run of SEALED_WEEKS: date, version, how many, where its figures are.
-SEALED_WEEK_RUNS: tuple[str, ...] = ()
+#: Each run of some SEALED_WEEKS: their seeds, and date, version, where its figures are.
+SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = ()

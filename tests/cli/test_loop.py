@@ -61,13 +61,20 @@ def test_decisions_of_a_machine_with_a_loop_are_those_of_its_recordings(
     assert one["measured_by"] == "sensor" and one["now_um"] > 0.0 and one["first_um"] is None
 
 
-def test_a_proposal_that_was_withdrawn_asks_nothing_of_a_person(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("after", "proposed"),
+    [
+        (LoopData(step=LoopAction.WITHDRAW, role="candidate"), []),
+        (LoopData(step=LoopAction.SHADOW, role="candidate", effects=["delay:DTF"]), []),
+        (LoopData(step=LoopAction.END, role="before", why="watched"), ["gain:DTF"]),
+    ],
+)
+def test_a_proposal_asks_something_of_a_person_until_it_is_withdrawn_or_another_candidate_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], after: LoopData, proposed: list[str]
 ) -> None:
-    withdrawn = (350, "loop", "withdrawn", LoopData(step=LoopAction.WITHDRAW).table())
-    folder = recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=(*TOLD, withdrawn))
-    (one,) = result([str(folder)], capsys)
-    assert one["proposed"] == [] and one["needs"] == ""
+    told = (*TOLD, (350, "loop", "after it", after.table()))
+    (one,) = result([str(recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=told))], capsys)
+    assert one["proposed"] == proposed and bool(one["needs"]) == bool(proposed)
 
 
 def finds_nothing(seen: list[Any]) -> Any:

@@ -25,8 +25,8 @@ from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
 from compensator.service.loop import live
 from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.earlier_rules import use_present_rule
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.one_place import use_both
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running, decode_loop
@@ -141,18 +141,18 @@ def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
 
 
 def watching(
-    verdict: ComparisonData, *, places: Literal[1, 2] = 2, hours: float = 30.0, misfit_h: float = 0.0
+    verdict: ComparisonData, *, rule: Literal[1, 2, 3] = 3, hours: float = 30.0, misfit_h: float = 0.0
 ) -> tuple[Loop, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
     now_ns = ADOPTED_NS + round(hours * HOUR_NS)
     before = Place(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
     state = LoopState(
-        places=places,
+        rule=rule,
         adopted_utc_ns=ADOPTED_NS,
         misfit_min=60.0 * misfit_h,
         diagnosis=Running(from_utc_ns=ADOPTED_NS, to_utc_ns=now_ns, why="planned"),
     )
-    state.put("watched" if places == 2 else "found", before)
+    state.put("watched" if rule > 1 else "found", before)
     return Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
 
 
@@ -200,7 +200,7 @@ def test_in_a_recording_with_one_place_a_candidate_waited(
     hours: float, verdict: ComparisonData, misfit_h: float, *, other_waits: bool, same_waits: bool
 ) -> None:
     for same, waits in ((False, other_waits), (True, same_waits)):
-        loop, now_ns = watching(verdict, places=1, hours=hours, misfit_h=misfit_h)
+        loop, now_ns = watching(verdict, rule=1, hours=hours, misfit_h=misfit_h)
         assert follows(loop, now_ns, same=same) == (("nothing", "waits") if waits else ("shadow", ""))
         assert loop.state.found is not None and loop.state.found.sha256 == "a" * 64
 
@@ -209,7 +209,7 @@ def of_version_1(state: LoopState) -> bytes:
     """Return a state with one place as version 1 wrote it."""
     table = msgspec.to_builtins(state)
     found = table.pop("found")
-    for name in ("places", "watched", "incoming"):
+    for name in ("rule", "watched", "incoming"):
         del table[name]
     parts = {name: found.pop(name) for name in ("comparison", "verdict", "error", "is_proposed")}
     phase = "proposed" if parts["is_proposed"] else "shadow" if found["role"] == "candidate" else "watching"
@@ -219,14 +219,14 @@ def of_version_1(state: LoopState) -> bytes:
 
 
 def test_a_state_of_version_1_is_read_decides_as_it_did_and_goes_on_with_two_places() -> None:
-    loop, now_ns = watching(judged(NOT_JUDGED), places=1)
+    loop, now_ns = watching(judged(NOT_JUDGED), rule=1)
     assert loop.state.found is not None
     loop.state.found.error.blocks = [(7, 1.5)]
     read = decode_loop(of_version_1(loop.state))
     assert msgspec.json.encode(read) == msgspec.json.encode(loop.state)
     again = Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], read)
     assert follows(again, now_ns) == ("nothing", "waits")
-    use_both(read)
+    use_present_rule(read)
     assert read.found is None and read.watched is not None and read.watched.error.blocks == [(7, 1.5)]
     read.diagnosis = loop.state.diagnosis
     assert follows(again, now_ns) == ("shadow", "")
@@ -237,13 +237,13 @@ def test_a_service_goes_on_with_two_places_after_a_recording_with_one() -> None:
     present = parse_model(extended(), source="present")
     before = Compensation(config, parse_model(QUILL, source="before"))
     before.begin(None)
-    state = watching(judged(NOT_JUDGED), places=1)[0].state
+    state = watching(judged(NOT_JUDGED), rule=1)[0].state
     assert state.found is not None
     state.found.sha256 = sha256_of(QUILL)
     opening = {"loop.json": of_version_1(state), "candidate.toml": QUILL, "candidate_state.json": before.state()}
     core = ModelLoop(config, present, opening)
     assert core.attachments().keys() == opening.keys()
-    core.use_both_places()
+    core.use_present_rule()
     moved = core.attachments()
     assert moved.keys() == {"loop.json", "before.toml", "before_state.json"} and moved["before.toml"] == QUILL
     assert ModelLoop(config, present, moved).state.phase == "watching"

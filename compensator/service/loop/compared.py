@@ -66,11 +66,13 @@ class Compared:
         self._place.verdict = found.verdict(deviations=self._settings.deviations)
         return True
 
-    def add_suspected(self, other: Outcome) -> None:
-        """Begin anew: before a sensor is suspected it has been wrong for a while."""
+    def add_suspected(self, other: Outcome) -> bool:
+        """Begin anew, and return whether something was compared: the sensor was wrong before it was suspected."""
         self._place.error.update(other)
-        if self._place.comparison.first_ns:
-            self._place.begin_anew()
+        if not self._place.comparison.first_ns:
+            return False
+        self._place.begin_anew()
+        return True
 
     def is_better(self, now_ns: int) -> bool:
         """Return whether a candidate has shown enough, and in its own hours, too."""

@@ -21,10 +21,11 @@ from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
+from compensator.service.loop.earlier_rules import falls_early, has_to_wait
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.one_place import has_to_wait
 from compensator.service.loop.place import (
     ADOPTION_H,
+    falls,
     leads,
     place_of_outgoing,
     role_of,
@@ -122,7 +123,9 @@ class Loop:
         for name, place in state.taken.items():
             compared, judge = self._compared(place), False
             if suspected:
-                compared.add_suspected(others[name])
+                begins_anew = compared.add_suspected(others[name]) and state.rule > 2
+                if begins_anew and place.is_proposed and not state.exchange:
+                    notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
             else:
                 judge = compared.add(present, others[name])
             if not state.exchange:
@@ -147,10 +150,8 @@ class Loop:
             return self._go_back(name, place) if verdict == ComparisonVerdict.BETTER else []
         if verdict == ComparisonVerdict.WORSE:
             return self._end(name, "worse")
-        if place.is_proposed and verdict != ComparisonVerdict.BETTER:
-            place.is_proposed = False
-            text = f"the proposal is withdrawn: {described(place.verdict)}"
-            return [self._note(place, LoopAction.WITHDRAW, text)]
+        if place.is_proposed and (falls(place.verdict, self._settings) or falls_early(state, place)):
+            return self._withdraw(place, described(place.verdict))
         if self._compared(place).is_better(now_ns) and (not place.is_proposed or self._may_adopt(place, now_ns)):
             return self._accept(place, now_ns)
         return []
@@ -184,6 +185,10 @@ class Loop:
         if not is_level:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [self._note(place, LoopAction.PROPOSE, text)]
+
+    def _withdraw(self, place: Place, why: str) -> list[Note]:
+        place.is_proposed = False
+        return [self._note(place, LoopAction.WITHDRAW, f"the proposal is withdrawn: {why}")]
 
     def _go_back(self, name: PlaceName, place: Place) -> list[Note]:
         self._exchange("back", name, place)

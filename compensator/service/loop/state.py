@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -13,7 +13,9 @@ from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state; one of a later version is refused.
-STATE_SCHEMA = 2
+STATE_SCHEMA = 3
+#: The present rule; a recording is audited by the one that it was decided by (`earlier_rules`).
+RULE: Final = 3
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
@@ -100,8 +102,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         What a diagnosis has found: a candidate, or the calibrated model.
     watched : Place, optional
         The model before the last adoption.
-    places : {1, 2}
-        How many there are: recordings before version 2 of the state have one (`one_place`).
+    rule : {1, 2, 3}
+        By which it is decided: in recordings before version 3 of the state an earlier one (`earlier_rules`).
     adopted_utc_ns : int
         Time of the last adoption; 0 before.
     effects : list of str
@@ -123,7 +125,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     clean_min: float = 0.0
     found: Place | None = None
     watched: Place | None = None
-    places: Literal[1, 2] = 2
+    rule: Literal[1, 2, 3] = RULE
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
@@ -165,7 +167,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def decode_loop(data: bytes) -> LoopState:
-    """Read a state; one of version 1 has one place.
+    """Read a state; one of version 1 has one place, and each goes by the rule of its time.
 
     Raises
     ------
@@ -176,6 +178,8 @@ def decode_loop(data: bytes) -> LoopState:
         read = msgspec.json.decode(data, type=dict[str, Any])
         if read.get("schema", 1) == 1:
             read = _with_places(read)
+        if read["schema"] == 2:
+            read |= {"schema": STATE_SCHEMA, "rule": read.pop("places")}
         if read["schema"] != STATE_SCHEMA:
             raise DataError(f"loop.json: schema = {read['schema']}, expected {STATE_SCHEMA}")
         return msgspec.convert(read, LoopState)
@@ -184,9 +188,9 @@ def decode_loop(data: bytes) -> LoopState:
 
 
 def _with_places(read: dict[str, Any]) -> dict[str, Any]:
-    """Return a state of version 1 in the present form: its only place holds whatever is in shadow."""
+    """Return a state of version 1 as one of version 2: its only place holds whatever is in shadow."""
     parts = {name: read.pop(name, None) for name in ("shadow", "phase", "comparison", "verdict", "other_error")}
-    read |= {"schema": STATE_SCHEMA, "places": 1}
+    read |= {"schema": 2, "places": 1}
     if parts["shadow"] is not None:
         read["found"] = parts["shadow"] | {
             "is_proposed": parts["phase"] == "proposed",

@@ -1,0 +1,126 @@
+"""A drawn machine-week as the service gets it: its configuration, its samples, and the error that is left."""
+
+import math
+
+import numpy as np
+
+from compensator.clock import NS
+from compensator.config import parse_config
+from compensator.demo.offline import sample_of
+from compensator.events import EventKind
+from compensator.messages import number
+
+#: 2026-01-05T00:00:00Z.
+MIDNIGHT_NS = 1_767_571_200 * NS
+PERIOD_S, MINUTE_NS = 60.0, 60 * NS
+#: For so long after a fault of a temperature the state of the model is wrong, and after a zero the offset is limited.
+AFTER_FAULT_MIN, LIMITED_MIN = 360, 15
+LOOP = '[loop]\npolicy = "adopt"\n'
+
+
+def config_of(week, model):
+    """Return the configuration of a machine as its commissioning would have it."""
+    calibration = week.calibration.columns
+    low, high = (
+        {name: float(side(calibration[name])) for name in ("t_q_degc", "at_degc")} for side in (np.nanmin, np.nanmax)
+    )
+    channels = "".join(_channel(name) for name in week.columns)
+    probe = ""
+    if week.probes:
+        probe = f"[probe]\nstd_um = {week.probe_std_um}\nmeasured_max_um = 100.0\nlargest_um = 60.0\n"
+    text = f"""
+line = []
+device = [{{name = "simulated"}}]
+machine.name = "{week.family}-{week.seed}"
+model.file = "model.toml"
+loss.predict_for_min = 30.0
+zero.rest_rate_um_per_min = 0.2
+guards.t_q_below_at_max_k = 2.0
+zenoh.prefix = "bench"
+recording.folder = "recordings"
+[limits]
+offset_max_um = 300.0
+offset_rate_max_um_per_min = 8.0
+[limits.validity]
+t_q_degc = [{low["t_q_degc"] - 10.0}, {high["t_q_degc"] + 15.0}]
+at_degc = [{low["at_degc"] - 8.0}, {high["at_degc"] + 8.0}]
+[plausibility]
+t_q_below_at_after_min = 30.0
+false_alarm_days = 30.0
+{probe}{LOOP}{channels}"""
+    return parse_config(text.encode(), source=f"{week.family} {week.seed}")
+
+
+def _channel(name):
+    limits = {
+        "t_q_degc": "range = [0.0, 90.0]\nrate_max_per_min = 5.0\nstuck_after_min = 120.0\n",
+        "at_degc": "range = [0.0, 50.0]\nrate_max_per_min = 2.0\nstuck_after_min = 240.0\n",
+        "y_um": "range = [-400.0, 400.0]\nrate_max_per_min = 30.0\nstuck_after_min = 60.0\n",
+    }
+    return f'[[channel]]\nname = "{name}"\ndevice = "simulated"\ninput = 0\n{limits.get(name, "")}'
+
+
+def samples_of(week, columns, true_um):
+    """Return for each minute in which the service runs: sample, what a probe before it shows, whether a zero is set.
+
+    Probes show the displacement that belongs to what is read.
+    """
+    start_ns = MIDNIGHT_NS + round(week.start_h * 60) * MINUTE_NS
+    visited = np.zeros(week.minutes, dtype=bool)
+    for minute in week.visits:
+        visited[minute + int(np.argmax(week.running[minute:]))] = True
+    # A person who sets a zero also sets that of the feature.
+    zeros = np.concatenate(([0], np.flatnonzero(visited)))
+    shown = np.full(week.minutes, math.nan)
+    for probe in week.probes:
+        zero = zeros[np.searchsorted(zeros, probe.minute) - 1]
+        shown[probe.minute] = true_um[probe.minute - 1] - true_um[zero] + probe.error_um
+    names = list(columns)
+    table = np.column_stack([columns[name] for name in names])
+    return [
+        (
+            sample_of(
+                week.family, i, start_ns + i * MINUTE_NS, dict(zip(names, table[i], strict=True)), period_s=PERIOD_S
+            ),
+            float(shown[i]),
+            bool(visited[i]),
+        )
+        for i in np.flatnonzero(week.running).tolist()
+    ]
+
+
+def error_of(outcomes, true_um):
+    """Return the error by minute since the last zero, µm, shape (n,); NaN where the service did not run."""
+    error, zero_um = np.full(true_um.size, math.nan), 0.0
+    for outcome in outcomes:
+        i = outcome.sample.seq
+        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+            zero_um = true_um[i]
+        error[i] = true_um[i] - zero_um + number(outcome.offset.y_offset_um)
+    return error
+
+
+def whole(week):
+    """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        if trouble.channel != "y_um":
+            found[trouble.from_min : trouble.to_min + AFTER_FAULT_MIN] = False
+    for minute in week.visits:
+        found[minute : minute + LIMITED_MIN] = False
+    return found
+
+
+def undisturbed(week):
+    """Return at which minutes nothing is wrong beside the machine, or has been seen to."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        after = [minute for minute in week.visits if minute >= trouble.to_min]
+        end = after[0] if after and trouble.kind not in ("break", "period", "hand") else trouble.to_min
+        found[trouble.from_min : end] = False
+    return found
+
+
+def rms(error):
+    good = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(good**2))) if good.size else math.nan

@@ -1,0 +1,125 @@
+"""A proposal stays until measured Y speaks against it: evidence that hovers at the limit makes no line come and go."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from compensator.service.loop.place import LEADS
+from compensator.service.loop.run import LoopRun, LoopStep
+from compensator.service.loop.state import RULE, LoopState, Place, decode_loop
+from compensator.service.transfer.comparison import DEVIATIONS
+from compensator.service.transfer.model_store import sha256_of
+from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
+from tests.service.test_loop_run import CHECKED, NIGHT
+from tests.service.test_loop_service import Looping, checked, in_phase
+from tests.service.test_restart import QUILL
+
+#: What is compared counts for a day at least: so long after the effect has become smaller nothing else is left of it.
+PROPOSING = {"policy": "propose", "shadow_h": 6.0, "record_h": 12.0}
+#: The candidate is right for twelve hours.
+RIGHT_H = 12
+
+
+def proposing(left: float, *, noise_um: float = 1.5) -> tuple[LoopRun, list[LoopStep]]:
+    """Run a candidate that is right for some hours; then its effect acts by a part only."""
+    loop = LoopRun(settings(loop=PROPOSING), QUILL, Night(shown(extended())))
+    ends = NIGHT + 60 * RIGHT_H
+    source = machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else left, noise_um=noise_um)
+    return loop, run(loop, source)
+
+
+def about_it(steps: Sequence[LoopStep]) -> list[str]:
+    """Return what is said about proposals."""
+    return [step for _, step, _ in decisions(steps) if step in ("propose", "withdraw", "end")]
+
+
+def test_a_proposal_stays_while_its_evidence_hovers() -> None:
+    loop, steps = proposing(0.5)
+    assert about_it(steps) == ["propose"] and loop.phase == "proposed"
+    verdicts = [one.verdict for step in steps for one in step.candidates]
+    assert "better" in verdicts and verdicts[-1] == "alike"
+
+
+def test_a_proposal_falls_once_when_the_present_model_is_better_so_far() -> None:
+    _, steps = proposing(0.4)
+    assert about_it(steps)[:2] == ["propose", "withdraw"] and about_it(steps).count("propose") == 1
+    (withdrawn,) = (
+        note for step in steps for note in step.events if note.kind == "loop" and note.data["step"] == "withdraw"
+    )
+    assert -DEVIATIONS < withdrawn.data["comparison"]["deviations"] <= -LEADS * DEVIATIONS
+
+
+def test_a_proposal_stands_on_no_evidence_that_a_suspected_sensor_has_given() -> None:
+    begins = NIGHT + 10 * 60
+
+    def drifting(i: int, values: dict[str, float]) -> None:
+        if i >= begins:
+            values["t_q_degc"] += 0.03 * (i - begins)
+
+    tables = CHECKED | {"loop": PROPOSING}
+    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    steps = run(loop, machine(begins + 360, acts=lambda i: float(i >= NIGHT), change=drifting))
+    assert about_it(steps) == ["propose", "withdraw"]
+    (text,) = (note.text for step in steps for note in step.events if "withdrawn" in note.text)
+    assert text == "the proposal is withdrawn: a sensor is suspected, so what was compared does not count"
+
+
+def test_in_a_recording_of_the_rule_before_a_proposal_falls_when_it_is_shown_no_longer() -> None:
+    loop = LoopRun(settings(loop=PROPOSING), QUILL, Night(shown(extended())))
+    loop._core.state.rule = 2
+    ends = NIGHT + 60 * RIGHT_H
+    steps = run(loop, machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else 0.5, noise_um=1.5))
+    assert about_it(steps)[:2] == ["propose", "withdraw"]
+    loop._core.use_present_rule()
+    assert loop._core.state.rule == RULE
+
+
+def test_a_state_of_version_2_decides_by_its_rule() -> None:
+    place = Place(sha256="a" * 64, effects=[], role="candidate", since_utc_ns=7, is_proposed=True)
+    table = msgspec.to_builtins(LoopState(found=place))
+    del table["rule"]
+    read = decode_loop(json.dumps(table | {"schema": 2, "places": 2}).encode())
+    assert read.rule == 2 and read.found == place
+
+
+def test_a_proposal_whose_evidence_hovers_is_the_same_after_a_kill() -> None:
+    night = Night(shown(extended()))
+    loop = LoopRun(settings(loop=PROPOSING), QUILL, night)
+    ends = NIGHT + 60 * RIGHT_H
+    source = machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else 0.5, noise_um=1.5)
+    run(loop, source, NIGHT + 2 * DAY)
+    assert loop.phase == "proposed" and loop._core.state.found is not None
+    assert loop._core.state.found.verdict.verdict == "alike"
+    resumed = LoopRun(settings(loop=PROPOSING), QUILL, night)
+    resumed.restore(loop.state())
+    assert resumed.phase == "proposed"
+    source, again = itertools.tee(source)
+    steps = run(loop, source)
+    for a, b in zip(steps, run(resumed, again), strict=True):
+        assert (a.outcome.offset, a.candidates, a.events) == (b.outcome.offset, b.candidates, b.events)
+    assert about_it(steps) == [] and loop.phase == "proposed"
+
+
+async def test_the_service_keeps_it_over_a_kill_and_a_replay_makes_it_again(tmp_path: Path) -> None:
+    proposed_at: list[int] = []
+
+    def acts(i: int) -> float:
+        return 0.5 if proposed_at and i >= proposed_at[0] else 1.0
+
+    service = Looping(tmp_path, shown(extended()), policy="propose", acts=acts)
+    service.use(service.config_bytes + b"record_h = 8.0\n")
+    await service.run(960, until=in_phase(service, "proposed", lambda: proposed_at.append(service.minute() // 2)))
+    await service.run(600)
+    await service.run_and_kill(120)
+    await service.run(1800, until=lambda _: service.candidates()[-1].verdict == "alike")
+    await service.run_and_kill(60)
+    await service.run(30)
+    assert service.steps() == [("diagnose", "planned"), ("shadow", ""), ("propose", "")]
+    assert service.candidates()[-1].verdict == "alike" and service.store.in_use() == QUILL
+    assert service.candidates()[-1].model_sha256 == sha256_of(extended())
+    checked(service)
