@@ -127,8 +127,7 @@ class RecordedOffsets(msgspec.Struct, frozen=True, kw_only=True):
 
     def messages(self) -> list[AxisOffset]:
         """Return the messages of all axes."""
-        found = (getattr(self, name) for name in self.__struct_fields__)
-        return [one for one in found if one is not UNSET]
+        return [one for one in msgspec.structs.asdict(self).values() if one is not UNSET]
 
 
 _Offsets = msgspec.defstruct(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .limits import LONGEST_MM
-from .message import decode, header_of, malformed, number, number_of, value_of
+from .message import USABLE, decode, header_of, malformed, number, number_of, value_of
 from .reasons import Reason
 
 #: Axes that have an offset, and angles that act on one of them.
@@ -59,7 +59,7 @@ class AxisMessage:
     @property
     def usable(self) -> bool:
         """Whether a receiver may follow it."""
-        return self.state in ("ok", "degraded")
+        return self.state in USABLE
 
 
 def parse_axis(payload: bytes, axis: str) -> AxisMessage:

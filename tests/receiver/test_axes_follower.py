@@ -21,19 +21,11 @@ from compensator.receiver import (
     ToolLimits,
 )
 from compensator.receiver.limits import Acceptance
+from tests.receiver.limits import MAX_UM, plain, sloped
 from tests.receiver.offsets import axis_offset, slope
 
-MACHINE, MAX_UM, RATE = "vmc-07", 50.0, 6.0
-PLAIN = AxisLimits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE)
-#: Y with a slope over a travel of a metre.
-SLOPED = AxisLimits(
-    offset_max_um=MAX_UM,
-    offset_rate_max_um_per_min=RATE,
-    slope_max_um_per_m=60.0,
-    position_min_mm=0.0,
-    position_max_mm=1000.0,
-    position_speed_max_mm_per_s=500.0,
-)
+MACHINE, RATE = "vmc-07", 6.0
+PLAIN, SLOPED = plain(RATE), sloped(RATE)
 TOOL = ToolLimits(length_min_mm=20.0, length_max_mm=400.0)
 
 
