@@ -254,6 +254,8 @@ def _constants(axes: Axes, axis: str) -> dict[str, Any]:
         found |= {"acts_on": tilt.acts_on or TILTS[axis], "reference_mm": tilt.reference_mm}
     if linear is not None and linear.slope is not None:
         found["reference_mm"] = linear.slope.reference_mm
+    if linear is not None and linear.sign != 1:
+        found["sign"] = linear.sign
     return found
 
 

@@ -126,9 +126,9 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
     async def following() -> bool:
         return said[-1] == "following"
 
-    def publish(seq: int, y: float, z: float, um_per_m: float, without: str = "") -> None:
+    def publish(seq: int, y: float, z: float, um_per_m: float, without: str = "", **own: Any) -> None:
         line = slope(um_per_m, 100.0)
-        service.put_axes(seq, without=without, y={"value": y, **line}, z=z, a=20.0)
+        service.put_axes(seq, without=without, y={"value": y, **line, **own}, z={"value": z, **own}, a=20.0)
 
     with router(zenoh), ScriptedService(zenoh) as service:
         async with plc, bridging(path, said) as bridge:
@@ -171,6 +171,8 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
             await until(lambda: says("[plc_beyond_limit]"), "no slope")
             await plc.slope.write_value(0.0)
             await until(lambda: holds(-13.0, -4.0, -20.0), "it goes on")
+            publish(5, 10.0, -4.0, 20.0, sign=-1)  # turned by the service as well; Z is turned by nobody else
+            await until(lambda: says("in effect neither does. (y) [signs_cancel]"), "both signs")
 
 
 @pytest.mark.parametrize(

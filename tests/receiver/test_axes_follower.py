@@ -218,6 +218,24 @@ def test_hold_and_fade_are_of_all_axes() -> None:
                 f.rebase("z", **{"applied_um": 1.0, **changes})
 
 
+@pytest.mark.parametrize(("published", "here", "said"), [(-1, -1, True), (-1, 1, False), (1, -1, False)])
+def test_an_axis_that_both_sides_turn_is_said(published: int, here: int, said: bool) -> None:
+    f = follower(y=PLAIN, z=AxisLimits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE, sign=here))
+    own = {"sign": published} if published != 1 else {}
+    assert sample(f, 0.0, 1, y=1.0, z={"value": 2.0, **own})
+    f.advance(0.0)
+    last = run(f, 0.0, 60.0)[-1]
+    assert um(last) == (1.0, 2.0 * here) and last.arrived  # it is said, not corrected: only a gauge knows
+    assert codes(last) == ({"signs_cancel"} if said else set()) and (not said or "(z) [signs_cancel]" in last.text)
+
+
+@pytest.mark.parametrize("sign", [0, 2, True, "1", None, [1]])
+def test_a_sign_that_is_none_drops_the_sample(sign: Any) -> None:
+    f = follower(y=PLAIN, z=PLAIN)
+    assert not sample(f, 0.0, 1, y=1.0, z={"value": 2.0, "sign": sign})
+    assert set(f.dropped) == {"malformed"}
+
+
 # ---------------------------------------------------------------------- tilt
 
 

@@ -257,6 +257,10 @@ def test_the_sense_of_a_control_is_that_of_its_offset_and_its_residual() -> None
     for one, other in zip(processed(plain, 90), processed(turned, 90), strict=True):
         assert by_axis(one)["z"].y_offset_um == -by_axis(other)["z"].y_offset_um
         assert one.estimate.axes["z_um"] == -other.estimate.axes["z_um"]  # type: ignore[attr-defined]
+    # Who applies it can see that it was turned; otherwise nothing is said.
+    assert json.loads(encode(by_axis(other)["z"]))["sign"] == -1
+    for offset in (by_axis(one)["z"], by_axis(other)["x"], by_axis(other)["y"]):
+        assert "sign" not in json.loads(encode(offset))
 
 
 def test_the_deviation_of_a_tilt_knows_that_its_probes_share_the_heat() -> None:
