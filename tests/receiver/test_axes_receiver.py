@@ -123,9 +123,8 @@ def test_through_a_router_together_or_not_at_all(tmp_path: Path) -> None:
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
             try:
                 assert process.stdout is not None
-                assert process.stdout.readline().startswith(
-                    "y +0.00, z +0.00 µm, "
-                )  # starting, or the answer was there at once
+                # Starting, or the answer was there at once.
+                assert process.stdout.readline().startswith("y +0.00, z +0.00 µm, ")
                 assert any("following" in line for line in process.stdout)
             finally:
                 process.terminate()

@@ -165,6 +165,10 @@ def test_an_offset_that_is_missing_or_of_no_axis_is_found(day: SeveralAxes, tmp_
     difference = audit([path]).difference
     assert difference is not None
     assert difference.topic == "offsets"
+    # A line for each axis, not one of all.
+    assert [field.name for field in difference.fields] == [f"message of {axis}" for axis in "xza"]
+    assert all(field.recorded is None and field.recomputed["axis"] in field.name[-1] for field in difference.fields)
+    assert max(map(len, difference.lines())) < 600
 
 
 @pytest.mark.parametrize("topic", ["offsets", "offset", "estimate"])
@@ -185,6 +189,8 @@ def test_a_second_value_beside_the_true_one_is_found_though_the_chain_fits(
     rechained_all([path], doubled)
     found = audit([path])
     assert found.differing or found.findings_count, "passed"
+    if topic == "offsets" and found.difference is not None:
+        assert max(map(len, found.difference.lines())) < 600
 
 
 def test_y_is_what_it_is_without_the_other_axes() -> None:
