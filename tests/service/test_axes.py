@@ -29,7 +29,18 @@ from tests.audit import made
 from tests.audit.attacks import rechained_all
 from tests.audit.tampering import Line
 from tests.service.records import sample
-from tests.service.several import AXES, SENSORS, SLOPE, TILT, SeveralAxes, by_axis, config_text, model_text, part
+from tests.service.several import (
+    AXES,
+    LIMITS,
+    SENSORS,
+    SLOPE,
+    TILT,
+    SeveralAxes,
+    by_axis,
+    config_text,
+    model_text,
+    part,
+)
 
 EVERY = (AXES, TILT, SLOPE)
 PARTS = ("y", "x", "z", "low", "high", "y_slope")
@@ -390,7 +401,11 @@ def test_a_checkpoint_beyond_the_limit_of_an_axis_is_not_used(tmp_path: Path) ->
         ((AXES.replace("offset_max_um = 150.0\n", ""),), "axis.z.offset_max_um: missing"),
         ((AXES.replace("150.0", "-1.0"),), "axis.z.offset_max_um = -1.0"),
         ((AXES.replace("150.0", "nan"),), "axis.z.offset_max_um = nan"),
-        ((AXES + "sign = 2\n",), "axis.z.sign = 2"),
+        ((AXES + "sign = 2\n",), "axis.z.sign = 2: expected one of: -1, 1"),
+        ((AXES + 'sign = "-1"\n',), "axis.z.sign = '-1': expected one of: -1, 1"),
+        ((AXES, TILT + 'acts_on = "w"\n'), "axis.a.acts_on = 'w': expected one of: x, y, z"),
+        ((AXES, '[loop]\npolicy = "maybe"\n'), "loop.policy = 'maybe': expected one of: off, propose, adopt"),
+        ((AXES, "[loop]\nevery_h = 5\n"), "loop.every_h = 5: expected one of: 4, 6, 8, 12, 24"),
         ((AXES, TILT.replace("reference_mm = 120.0", "reference_mm = 1e9")), "axis.a.reference_mm = 1000000000.0"),
         ((AXES, TILT.replace("distance_mm = 200.0", "distance_mm = 0.0")), "axis.a.distance_mm = 0.0"),
         ((AXES.replace("[axis.y]", "[axis.y]\nsign = -1"),), "axis.y.sign = -1: expected 1"),
@@ -399,7 +414,8 @@ def test_a_checkpoint_beyond_the_limit_of_an_axis_is_not_used(tmp_path: Path) ->
           TILT + 'acts_on = "x"\n'), "axis.a: acts on 'x', expected one of: y, z"),
         ((AXES, TILT.replace('"high"', '"low"')), "axis.a.probes"),
         ((AXES + 'part = "x"\n',), "axis.z.part = 'x': expected a part of its own, axis.x has this one"),
-        ((AXES.partition("[axis.x]")[2].join(["[axis.x]", ""]),), "axis.y: missing"),
+        ((AXES.partition("[axis.x]")[2].join(["[axis.x]", ""]),), "axis.y: missing; zero, checks and probes of"),
+        (("[axis.z]\n" + LIMITS,), "Where a single axis is corrected there is no [axis.*]: that axis is called Y"),
         ((AXES, '[loop]\npolicy = "propose"\n'), "loop.policy: expected 'off' with [axis.*]"),
     ],
 )  # fmt: skip
