@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 from msgspec import Meta
@@ -395,18 +395,37 @@ def _with_nul(value: Any, where: str = "") -> str | None:
     return next((place for place in found if place is not None), None)
 
 
-def _keys_at(where: str) -> list[str]:
-    """Return the keys of a table, such as `limits` or `channel[1]`."""
-    table: Any = Config
+def _type_at(where: str) -> Any:
+    """Return the annotation of a table or a value, such as `limits` or `channel[1].name`."""
+    found: Any = Config
     for part in re.findall(r"[^.\[\]]+", re.sub(r"\[\d+\]", "", where)):
-        of = {field.encode_name: field.type for field in msgspec.structs.fields(table)}[part]
-        (table,) = (one for one in _types_in(of) if isinstance(one, type) and issubclass(one, msgspec.Struct))
-    return [field.encode_name for field in msgspec.structs.fields(table)]
+        found = {field.encode_name: field.type for field in msgspec.structs.fields(_table_in(found))}[part]
+    return found
+
+
+def _table_in(annotation: Any) -> type[msgspec.Struct]:
+    (table,) = (one for one in _types_in(annotation) if isinstance(one, type) and issubclass(one, msgspec.Struct))
+    return table
+
+
+def _keys_at(where: str) -> list[str]:
+    """Return the keys of a table."""
+    return [field.encode_name for field in msgspec.structs.fields(_table_in(_type_at(where)))]
+
+
+def _choices_at(where: str) -> list[Any]:
+    """Return what a value may be that is one of a few; nothing for any other value."""
+    try:
+        types = _types_in(_type_at(where))
+    except (KeyError, ValueError):  # a name that the user gave, such as a channel's
+        return []
+    return [choice for one in types if get_origin(one) is Literal for choice in get_args(one)]
 
 
 def _types_in(annotation: Any) -> list[Any]:
     """Return a type and those that it is made of."""
-    return [annotation, *(one for part in get_args(annotation) for one in _types_in(part))]
+    parts = () if get_origin(annotation) is Literal else get_args(annotation)
+    return [annotation, *(one for part in parts for one in _types_in(part))]
 
 
 def _in_words(message: str, table: object) -> str:
@@ -429,6 +448,8 @@ def _in_words(message: str, table: object) -> str:
             value = None
             break
     shown = "" if value is None or isinstance(value, (dict, list)) else f" = {repr(value)[:60]}"
+    if choices := _choices_at(where):
+        text = f"expected one of: {', '.join(map(str, choices))}"
     return f"{where}{shown}: {text}"
 
 

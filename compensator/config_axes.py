@@ -120,13 +120,19 @@ def with_limits_of_y(table: dict[str, Any]) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        If the limits are given twice.
+        If the limits are given twice, or Y is missing.
     msgspec.ValidationError
         If the tables of the axes are wrong.
     """
     limits = table.get("limits")
     if "axis" not in table or not isinstance(limits, dict):
         return table
+    if isinstance(table["axis"], dict) and FIRST not in table["axis"]:
+        raise ConfigError(
+            f"axis.{FIRST}: missing; zero, checks and probes of the machine are those of Y, so several axes have it "
+            "among them: add [axis.y]. Where a single axis is corrected there is no [axis.*]: that axis is called Y "
+            "(y_um, [limits]), and the receiver's program applies the offset to it"
+        )
     axes = msgspec.convert({"axis": table["axis"]}, _AxisTables).axis
     for key in _LIMITS:
         if key in limits:

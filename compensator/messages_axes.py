@@ -39,6 +39,9 @@ class AxisOffset(Offset, frozen=True, kw_only=True):
         axis at which its offset holds, mm.
     y_slope_um_per_m, y_slope_rate_um_per_m_per_min, y_slope_std_um_per_m : float or None, optional
         How the offset changes with the position of the axis, µm/m.
+    sign : int, optional
+        −1 where the service has turned what was calibrated into the sense of the control's axis: whoever applies it
+        does not turn it again. Absent where nothing was turned.
     """
 
     axis: str
@@ -48,6 +51,7 @@ class AxisOffset(Offset, frozen=True, kw_only=True):
     y_slope_um_per_m: float | UnsetType | None = UNSET
     y_slope_rate_um_per_m_per_min: float | UnsetType | None = UNSET
     y_slope_std_um_per_m: float | UnsetType | None = UNSET
+    sign: int | UnsetType = UNSET
 
 
 class AxesEstimate(EstimateMessage, frozen=True, kw_only=True):
@@ -127,8 +131,7 @@ class RecordedOffsets(msgspec.Struct, frozen=True, kw_only=True):
 
     def messages(self) -> list[AxisOffset]:
         """Return the messages of all axes."""
-        found = (getattr(self, name) for name in self.__struct_fields__)
-        return [one for one in found if one is not UNSET]
+        return [one for one in msgspec.structs.asdict(self).values() if one is not UNSET]
 
 
 _Offsets = msgspec.defstruct(

@@ -119,9 +119,8 @@ class ReplayCheck:
         if self._has_unknown_axes(offsets, sample, records):
             return
         if len(step.candidates) > len(candidates):
-            extra = step.candidates[len(candidates)].data.decode("utf-8", "replace")
-            recorded = Field(name="message", recorded=extra, recomputed=None)
-            self._count(self._difference("candidate", sample, (recorded,)))
+            extra = step.candidates[len(candidates)].data
+            self._count(self._difference("candidate", sample, _of_one_side(recorded=extra)))
             return
         messages: list[tuple[str, Message, RawRecord | None]] = [
             ("sample", sample, records.get("sample")),
@@ -131,8 +130,7 @@ class ReplayCheck:
         ]
         for topic, message, record in messages:
             if record is None:
-                nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
-                self._incomplete = self._difference(topic, sample, (nothing,))
+                self._incomplete = self._difference(topic, sample, _of_one_side(recomputed=message))
                 return
             if not self._matches(topic, message, record, of=sample):
                 return
@@ -153,8 +151,7 @@ class ReplayCheck:
         for topic, message in messages.items():
             record = step.records.get(topic)
             if record is None:
-                nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
-                self._incomplete = self._difference(topic, held[0], (nothing,))
+                self._incomplete = self._difference(topic, held[0], _of_one_side(recomputed=message))
                 return
             if not self._matches(topic, message, record, of=held[0]):
                 return
@@ -173,22 +170,20 @@ class ReplayCheck:
     def _has_repeated(self, step: RecordedStep, of: Message) -> bool:
         """Count a message that is recorded twice for one sample: the replay gives one, whatever the other says."""
         for record in step.repeated[:1]:
-            text = record.data.decode("utf-8", "replace")
-            field = Field(name="message recorded twice", recorded=text, recomputed=None)
-            self._count(self._difference(record.topic, of, (field,)))
+            fields = _of_one_side("message recorded twice", recorded=record.data)
+            self._count(self._difference(record.topic, of, fields))
         return bool(step.repeated)
 
     def _of_no_sample(self, step: RecordedStep) -> Difference | None:
         """Return the first message that belongs to a sample, in a group without one; a kill may leave it."""
         for record in (*step.records.values(), *step.candidates):
             if record.topic != "seal":
-                field = Field(name="message", recorded=record.data.decode("utf-8", "replace"), recomputed=None)
                 return Difference(
                     file=self._result.file,
                     topic=record.topic,
                     seq=self._result.last_seq,
                     time_utc_ns=record.log_time_ns,
-                    fields=(field,),
+                    fields=_of_one_side(recorded=record.data),
                 )
         return None
 
@@ -196,8 +191,7 @@ class ReplayCheck:
         """Count offsets that are recorded for axes that the machine has not."""
         if "offsets" not in records or "offsets" in messages:
             return False
-        text = records["offsets"].data.decode("utf-8", "replace")
-        self._count(self._difference("offsets", of, (Field(name="message", recorded=text, recomputed=None),)))
+        self._count(self._difference("offsets", of, _of_one_side(recorded=records["offsets"].data)))
         return True
 
     def _probes_match(self, step: RecordedStep, outcome: Outcome) -> bool:
@@ -235,6 +229,22 @@ class ReplayCheck:
         self._result.differing += 1
         if self._result.difference is None:
             self._result.difference = difference
+
+
+def _of_one_side(name: str = "message", *, recorded: bytes = b"", recomputed: Any = None) -> tuple[Field, ...]:
+    """Return the field of a message that is recorded or recomputed only; offsets of several axes have one for each."""
+    text = recorded.decode("utf-8", "replace") if recorded else None
+    try:
+        table = msgspec.json.decode(recorded) if recorded else msgspec.to_builtins(recomputed)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        table = None
+    if isinstance(table, dict) and table and all(isinstance(one, dict) for one in table.values()):
+        sides = ((one, None) if recorded else (None, one) for one in table.values())
+        return tuple(
+            Field(name=f"{name} of {axis}", recorded=there, recomputed=here)
+            for axis, (there, here) in zip(table, sides, strict=True)
+        )
+    return (Field(name=name, recorded=text, recomputed=None if recorded else table),)
 
 
 def _missing_note(note: Note, events: list[Event]) -> Field:

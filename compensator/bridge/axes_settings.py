@@ -13,7 +13,8 @@ from compensator.bridge.settings import (
     OpcUa,
     check_connection,
     check_value,
-    load_bridge,
+    opcua_from,
+    opcua_table,
     require_sign,
     with_files,
 )
@@ -108,7 +109,7 @@ def load_any_bridge(path: str | Path) -> tuple[Settings, OpcUa] | tuple[AxesSett
     try:
         receiver, tables = load_any(path)
         if isinstance(receiver, Settings):
-            return load_bridge(path)
+            return receiver, opcua_from(tables, str(path))
         opcua = _load(receiver, tables, str(path))
     except ReceiverError as error:
         raise ConfigError(str(error)) from error
@@ -116,11 +117,7 @@ def load_any_bridge(path: str | Path) -> tuple[Settings, OpcUa] | tuple[AxesSett
 
 
 def _load(receiver: AxesSettings, tables: dict[str, Any], path: str) -> OpcUaAxes:
-    table = tables.pop("opcua", None)
-    if not isinstance(table, dict):
-        raise ReceiverError(f"{path}: opcua: missing, expected a table [opcua]")
-    if tables:
-        raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected receiver, axis, tool, opcua")
+    table = opcua_table(tables, path, "receiver, axis, tool, opcua")
     named = table.get("axis")
     named = named if isinstance(named, dict) else {}
     for axis in {**receiver.linear, **named}:

@@ -100,6 +100,7 @@ class AxesBridge(PlcClient):
         self._receiver = receiver
         places = settings.places()
         self.register = AxesRegisters(receiver.follower, places, settings.plc.resume_after_s)
+        receiver.follower.signs |= {axis: place.sign for axis, place in places.items()}
         # For the control, which adds slope times distance from there.
         self._at_mm = {axis: place.reference_mm for axis, place in places.items()}
         self._server: Any = None

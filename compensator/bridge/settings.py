@@ -100,18 +100,41 @@ def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
     """
     try:
         receiver, tables = load_settings(path)
-        table = tables.pop("opcua", None)
-        if not isinstance(table, dict):
-            raise ReceiverError(f"{path}: opcua: missing, expected a table [opcua]")
-        if tables:
-            raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected receiver, opcua")
-        require_sign(table, f"{path}: opcua")
-        opcua = read_table(OpcUa, table, source=str(path), name="opcua")
-        check_value(opcua, f"{path}: opcua")
-        check_connection(opcua, str(path))
+        return receiver, opcua_from(tables, str(path))
     except ReceiverError as error:
         raise ConfigError(str(error)) from error
-    return receiver, with_files(opcua, str(path))
+
+
+def opcua_from(tables: dict[str, Any], path: str) -> OpcUa:
+    """Check the tables beside `[receiver]` of one axis.
+
+    Raises
+    ------
+    ConfigError, ReceiverError
+        As `load_bridge`.
+    """
+    table = opcua_table(tables, path, "receiver, opcua")
+    require_sign(table, f"{path}: opcua")
+    opcua = read_table(OpcUa, table, source=path, name="opcua")
+    check_value(opcua, f"{path}: opcua")
+    check_connection(opcua, path)
+    return with_files(opcua, path)
+
+
+def opcua_table(tables: dict[str, Any], path: str, expected: str) -> dict[str, Any]:
+    """Return `[opcua]`, beside which a bridge's file has no other table.
+
+    Raises
+    ------
+    ReceiverError
+        If it is missing, or another one is there.
+    """
+    table = tables.pop("opcua", None)
+    if not isinstance(table, dict):
+        raise ReceiverError(f"{path}: opcua: missing, expected a table [opcua]")
+    if tables:
+        raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected {expected}")
+    return table
 
 
 def require_sign(table: dict[str, Any], where: str) -> None:

@@ -62,13 +62,17 @@ def _axes(setup: Setup) -> dict[str, Any]:
     unused = [name for name in parse_axes(setup.model_bytes, source="model") if name not in used]
     if setup.config.axis is None:
         return {"axes": [FIRST], "unused_parts": unused} if unused else {}
-    return {"axes": list(setup.config.axis.names()), "unused_parts": unused}
+    turned = [name for name, axis in setup.config.axis.linear().items() if axis.sign != 1]
+    found = {"axes": list(setup.config.axis.names()), "unused_parts": unused}
+    return {**found, "turned": turned} if turned else found
 
 
 def _axes_text(axes: dict[str, Any]) -> str:
     if not axes:
         return ""
     text = f"\naxes: {', '.join(axes['axes'])}"
+    if turned := axes.get("turned"):
+        text += f"; sign = -1 of {', '.join(turned)}: the published offset is turned, so no receiver turns it again"
     if axes["unused_parts"]:
         text += f"; the model also has {', '.join(axes['unused_parts'])}, for which there is no table [axis.*]"
     return text

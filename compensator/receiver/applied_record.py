@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from .settings import read_file
+from .values import finite
 
 #: A value is written when it has changed by this, µm, and at least this often, s.
 STEP_UM, EVERY_S = 0.02, 2.0
@@ -46,8 +47,7 @@ class AppliedRecord:
         OSError
             If the file cannot be written.
         """
-        if offset_um is not None and not math.isfinite(offset_um):
-            offset_um = None
+        offset_um = finite(offset_um)
         if self._last is not None and not self._is_due(time_utc_ns, offset_um):
             return
         if self._path.exists() and self._path.stat().st_size > LONGEST:

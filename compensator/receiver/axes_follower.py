@@ -51,6 +51,11 @@ class AxesFollower(Modes[Sample]):
     last_sequence : int
         Highest number used before a restart; −1 if unknown.
 
+    Attributes
+    ----------
+    signs : dict of str to int
+        −1 where this side turns the axis; a bridge that does it itself enters it here.
+
     Raises
     ------
     ReceiverError
@@ -76,6 +81,7 @@ class AxesFollower(Modes[Sample]):
         self._movers = {
             axis: AxisMover(linear[axis], start_um.get(axis, 0.0), self.step_max_s) for axis in LINEAR if axis in linear
         }
+        self.signs = {axis: mover.limits.sign for axis, mover in self._movers.items()}
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -182,7 +188,11 @@ class AxesFollower(Modes[Sample]):
         step_s = self._step_s(now_s)
         state, held, reasons = self._state(now_s)
         missing = self._assembler.missing(now_s, self.last_sequence)
-        reasons = [*reasons, *filter(None, (missing, self._further())), *self._levers.measure(control.tool_length_mm)]
+        reasons = [
+            *reasons,
+            *filter(None, (missing, self._further(), self._turned())),
+            *self._levers.measure(control.tool_length_mm),
+        ]
         done = {}
         for axis, mover in self._movers.items():
             located = mover.locate(now_s, control.positions_mm.get(axis))
@@ -262,6 +272,12 @@ class AxesFollower(Modes[Sample]):
         held = self._gate.held
         further = [] if held is None else [axis for axis in held.message.axes[0].axes if axis not in self.axes]
         return Reason("further_axes", ", ".join(further)) if further else None
+
+    def _turned(self) -> Reason | None:
+        """Return which axes both the service and this side turn, so that neither does."""
+        held = self._gate.held
+        turned = [] if held is None else [a for a, sign in self.signs.items() if held.message.of(a).sign == sign == -1]
+        return Reason("signs_cancel", ", ".join(turned)) if turned else None
 
     def _applied(self, now_s: float, reasons: list[Reason], done: Mapping[str, _Axis]) -> AppliedAxes:
         held = self._gate.held

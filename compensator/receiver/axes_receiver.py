@@ -18,6 +18,7 @@ from .client import ANSWER_TIMEOUT_S, Client, bytes_of, monotonic_s, waiting
 from .modes import Modes
 from .sample import Sample
 from .tool_length import ToolLength
+from .values import finite
 
 
 class AxesReceiver(Client):
@@ -111,7 +112,7 @@ class AxesReceiver(Client):
             direction in which the service measures, for Y in `applied_file`, for another axis in a file beside it.
         """
         for axis, record in self._records.items():
-            um = applied_um.get(axis)
+            um = finite(applied_um.get(axis))
             self._append(record, None if um is None else self._signs[axis] * um)
 
     # ------------------------------------------------------------------ the length of the tool

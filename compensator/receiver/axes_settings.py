@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from .axes_follower import check_axes
 from .axis_message import LINEAR, TILTS
 from .errors import ReceiverError
 from .limits import AxisLimits, TiltLimits, ToolLimits
-from .settings import Settings, Source, load_tables, read_table, settings_from, source_from
+from .settings import Settings, Source, read_table, receiver_tables, settings_from, source_from
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,17 +59,9 @@ def load_any(path: str | Path) -> tuple[Settings | AxesSettings, dict[str, Any]]
         One line that names file, key, value and what was expected.
     """
     path = Path(path)
-    tables = load_tables(path)
-    table = tables.pop("receiver", None)
-    if not isinstance(table, dict):
-        raise ReceiverError(f"{path}: receiver: missing, expected a table [receiver]")
-    axis = tables.get("axis")
-    named = {name: one for name, one in axis.items() if isinstance(one, dict)} if isinstance(axis, dict) else {}
+    table, named, others = receiver_tables(path)
     if not named:
-        return settings_from(table, source=str(path), folder=path.parent), tables
-    tables["axis"] = {key: value for key, value in tables["axis"].items() if key not in named}
-    if not tables["axis"]:
-        del tables["axis"]
+        return settings_from(table, source=str(path), folder=path.parent), others
     for key in ("offset_max_um", "offset_rate_max_um_per_min"):
         if key in table:
             raise ReceiverError(f"{path}: receiver.{key}: expected it in each table [axis.{next(iter(named))}] instead")
@@ -77,23 +71,19 @@ def load_any(path: str | Path) -> tuple[Settings | AxesSettings, dict[str, Any]]
     except ReceiverError as error:
         raise ReceiverError(f"{path}: receiver.{error}") from error
     axes = {name: _axis(name, one, str(path)) for name, one in named.items()}
-    tool = _tool(tables, str(path))
+    tool = _tool(others, str(path))
     try:
         check_axes(axes, tool)
     except ReceiverError as error:
         raise ReceiverError(f"{path}: {error}") from error
-    return AxesSettings(source=source, axes=axes, tool=tool), tables
+    return AxesSettings(source=source, axes=axes, tool=tool), others
 
 
 def _axis(name: str, table: Mapping[str, Any], source: str) -> AxisLimits | TiltLimits:
     if name not in LINEAR + TILTS:
         raise ReceiverError(f"{source}: axis.{name}: unknown axis, expected one of: {', '.join(LINEAR + TILTS)}")
     kind: type[AxisLimits | TiltLimits] = AxisLimits if name in LINEAR else TiltLimits
-    try:
-        return read_table(kind, table, source=source, name=f"axis.{name}")
-    except ReceiverError as error:
-        text = str(error)
-        raise error if text.startswith(source) else ReceiverError(f"{source}: axis.{name}.{text}") from error
+    return _named(kind, table, source, f"axis.{name}")
 
 
 def _tool(tables: dict[str, Any], source: str) -> ToolLimits | None:
@@ -102,8 +92,13 @@ def _tool(tables: dict[str, Any], source: str) -> ToolLimits | None:
         return None
     if not isinstance(table, dict):
         raise ReceiverError(f"{source}: tool = {table!r:.60}: expected a table [tool]")
+    return _named(ToolLimits, table, source, "tool")
+
+
+def _named(kind: type[T], table: Mapping[str, Any], source: str, name: str) -> T:
+    """Read a table whose limits check themselves, and know neither file nor table."""
     try:
-        return read_table(ToolLimits, table, source=source, name="tool")
+        return read_table(kind, table, source=source, name=name)
     except ReceiverError as error:
         text = str(error)
-        raise error if text.startswith(source) else ReceiverError(f"{source}: tool.{text}") from error
+        raise error if text.startswith(source) else ReceiverError(f"{source}: {name}.{text}") from error

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .limits import LONGEST_MM
-from .message import decode, header_of, malformed, number, number_of, value_of
+from .message import USABLE, decode, header_of, malformed, number, number_of, value_of
 from .reasons import Reason
 
 #: Axes that have an offset, and angles that act on one of them.
@@ -39,6 +39,8 @@ class AxisMessage:
         Position for which the offset holds; of an angle the length of the tool, mm. 0 without angle and slope.
     acts_on : str
         Axis on which an angle acts; empty for the others.
+    sign : int
+        −1 where the service has turned the direction of the axis.
     """
 
     axis: str
@@ -55,11 +57,12 @@ class AxisMessage:
     slope_rate_um_per_m_per_min: float = 0.0
     reference_mm: float = 0.0
     acts_on: str = ""
+    sign: int = 1
 
     @property
     def usable(self) -> bool:
         """Whether a receiver may follow it."""
-        return self.state in ("ok", "degraded")
+        return self.state in USABLE
 
 
 def parse_axis(payload: bytes, axis: str) -> AxisMessage:
@@ -83,6 +86,7 @@ def parse_axis(payload: bytes, axis: str) -> AxisMessage:
     return AxisMessage(
         axis=axis,
         axes=_axes(table, axis),
+        sign=_sign(table),
         offset=offset,
         rate_per_min=rate,
         **head,
@@ -101,6 +105,14 @@ def _axes(table: dict[str, Any], axis: str) -> tuple[str, ...]:
     if len(set(axes)) != len(axes):
         raise malformed("axes", axes, "each axis once")
     return tuple(axes)
+
+
+def _sign(table: dict[str, Any]) -> int:
+    """Return by what the service has turned the axis; it says so only where it has."""
+    sign = table.get("sign", 1)
+    if isinstance(sign, bool) or sign not in (1, -1):
+        raise malformed("sign", sign, "1 or -1")
+    return int(sign)
 
 
 def _bounded(table: dict[str, Any], name: str, unit: str) -> tuple[float | None, float]:

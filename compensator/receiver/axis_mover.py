@@ -14,6 +14,7 @@ from .errors import ReceiverError
 from .limits import AxisLimits
 from .modes import ARRIVED_UM, moved
 from .reasons import Reason
+from .values import finite, shown
 
 #: A position may have been read this long before or after its time, s.
 _JITTER_S = 0.05
@@ -93,18 +94,19 @@ class AxisMover:
         ReceiverError
             Where it is not within the limits at each position.
         """
-        from_mm = self._position_mm if at_mm is None else at_mm
-        ends = tuple(applied_um + slope_um_per_m * (place - from_mm) / 1000.0 for place in self.places_mm)
+        given = map(finite, (applied_um, slope_um_per_m, self._position_mm if at_mm is None else at_mm))
+        um, slope, from_mm = (math.nan if number is None else number for number in given)
+        ends = tuple(um + slope * (place - from_mm) / 1000.0 for place in self.places_mm)
         most = self.limits.offset_max_um
-        if not (math.isfinite(applied_um) and all(abs(end) <= most for end in ends)):
+        if not all(abs(end) <= most for end in ends):  # not for NaN either
             raise ReceiverError(
-                f"applied offset = {applied_um} µm, slope {slope_um_per_m} µm/m: expected at most offset_max_um = "
-                f"{most:g} at each position; correct the control first"
+                f"applied offset = {shown(applied_um)} µm, slope {shown(slope_um_per_m)} µm/m: expected at most "
+                f"offset_max_um = {most:g} at each position; correct the control first"
             )
         self.ends_um = ends
         self.owed_um = 0.0
-        if at_mm is not None and len(ends) == 2:
-            self._position_mm = max(self.places_mm[0], min(self.places_mm[1], at_mm))
+        if len(ends) == 2:
+            self._position_mm = max(self.places_mm[0], min(self.places_mm[1], from_mm))
 
     def locate(self, now_s: float, position_mm: float | None) -> Reason | None:
         """Go to the axis' position; a position that cannot be the axis' motion does not move the offset.
@@ -123,10 +125,13 @@ class AxisMover:
         """
         if len(self.places_mm) == 1:
             return None
-        if position_mm is None or not math.isfinite(position_mm):
-            return Reason("no_position", f"at {self._position_mm:.3f} mm")
+        number = finite(position_mm)
+        if number is None:
+            here = f"at {self._position_mm:.3f} mm"
+            known = position_mm is None or isinstance(position_mm, float)
+            return Reason("no_position", here if known else f"{here}; {shown(position_mm)}, expected a number")
         least, most = self.places_mm
-        place = max(least, min(most, position_mm))
+        place = max(least, min(most, number))
         passed_s = 0.0 if self._located_s is None else min(max(now_s - self._located_s, 0.0), self._step_max_s)
         known, way_mm = self._located_s is not None, abs(place - self._position_mm)
         self._located_s = now_s
@@ -136,8 +141,8 @@ class AxisMover:
             self._shift_to(before_um)
             return Reason("position_jumped", f"by {way_mm:.1f} mm") if known else None
         self._position_mm = place
-        beyond = f"{position_mm:.3f} mm, travel {least:g} to {most:g}"
-        return None if place == position_mm else Reason("position_beyond", beyond)
+        beyond = f"{number:.3f} mm, travel {least:g} to {most:g}"
+        return None if place == number else Reason("position_beyond", beyond)
 
     def _shift_to(self, offset_um: float) -> None:
         """Shift the line so that it has this value at the present position."""

@@ -17,6 +17,7 @@ from .limits import Limits
 from .message import OffsetMessage, Rejected, parse_offset
 from .modes import ARRIVED_UM, FollowerState, Modes, followed_s, moved
 from .reasons import Reason, steady
+from .values import finite, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,12 +108,13 @@ class Follower(Modes[OffsetMessage]):
         ReceiverError
             Where it is not a number within the limits.
         """
-        if not (math.isfinite(applied_um) and abs(applied_um) <= self.limits.offset_max_um):
+        number = finite(applied_um)
+        if number is None or abs(number) > self.limits.offset_max_um:
             raise ReceiverError(
-                f"applied offset = {applied_um} µm: expected at most offset_max_um = {self.limits.offset_max_um:g}; "
-                f"correct the control first"
+                f"applied offset = {shown(applied_um)} µm: expected at most offset_max_um = "
+                f"{self.limits.offset_max_um:g}; correct the control first"
             )
-        self.applied_um = float(applied_um)
+        self.applied_um = number
 
     # ------------------------------------------------------------------ messages
 

@@ -18,6 +18,8 @@ SEQ_MAX = 100_000_000_000
 #: Axes and angles that a service may publish besides Y.
 FURTHER = ("x", "z", "a", "b")
 _STATES = ("starting", "ok", "degraded", "hold", "fault")
+#: States of which a receiver follows the offset.
+USABLE = ("ok", "degraded")
 #: Number of codes in a message, and their length.
 _CODES_MAX, _CODE_LENGTH = 100, 200
 _INT_MAX = 2**63 - 1
@@ -76,7 +78,7 @@ class OffsetMessage:
     @property
     def usable(self) -> bool:
         """Whether a receiver may follow it."""
-        return self.state in ("ok", "degraded")
+        return self.state in USABLE
 
 
 def parse_offset(payload: bytes) -> OffsetMessage:
@@ -165,7 +167,7 @@ def value_of(table: dict[str, Any], name: str, unit: str) -> tuple[float | None,
         `malformed`.
     """
     value, rate = number(table, f"{name}_{unit}"), number(table, f"{name}_rate_{unit}_per_min")
-    if value is None and table.get("state") in ("ok", "degraded"):
+    if value is None and table.get("state") in USABLE:
         raise malformed(f"{name}_{unit}", None, f"a number in state {table['state']}")
     std = number(table, f"{name}_std_{unit}")
     if std is not None and std < 0.0:

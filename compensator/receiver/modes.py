@@ -8,6 +8,7 @@ from typing import Any, Generic, Literal
 from .errors import ReceiverError
 from .gate import Gate, Held, M
 from .reasons import Reason
+from .values import finite, shown
 
 #: Part of `valid_for_s` for which the published rate is followed: the rate holds until the next sample, and a message
 #: is valid for two to three samples.
@@ -93,9 +94,10 @@ class Modes(Generic[M]):
         ReceiverError
             Where the rate is not above 0.
         """
-        if not (math.isfinite(rate_um_per_min) and rate_um_per_min > 0.0):
-            raise ReceiverError(f"fade rate = {rate_um_per_min} µm/min: expected a number above 0")
-        self._mode, self._fade_rate_um_per_min = "fade", rate_um_per_min
+        rate = finite(rate_um_per_min)
+        if rate is None or rate <= 0.0:
+            raise ReceiverError(f"fade rate = {shown(rate_um_per_min)} µm/min: expected a number above 0")
+        self._mode, self._fade_rate_um_per_min = "fade", rate
 
     def snapshot(self) -> dict[str, Any]:
         """Return what must survive a restart."""

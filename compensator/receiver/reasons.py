@@ -101,6 +101,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The service publishes further axes, which this receiver does not apply.",
         "Add their tables to the receiver's settings if the control is to apply them.",
     ),
+    "signs_cancel": (
+        "The service and this side both turn the direction of an axis, so that in effect neither does.",
+        "Remove sign = -1 on both sides if a dial gauge shows the right direction, else on one.",
+    ),
     "slope_not_applied": (
         "The service publishes a slope over the position, which this receiver does not apply.",
         "Set slope_max_um_per_m and the axis' travel in the receiver's settings.",

@@ -120,15 +120,36 @@ def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
         One line that names file, key, value and what was expected.
     """
     path = Path(path)
-    tables = load_tables(path)
-    table = tables.pop("receiver", None)
+    table, axes, others = receiver_tables(path)
+    if axes:
+        raise ReceiverError(f"{path}: axis.{next(iter(axes))}: this program applies one axis; several need load_any")
+    return settings_from(table, source=str(path), folder=path.parent), others
+
+
+def receiver_tables(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[str, Any]]:
+    """Read a TOML file with the table `[receiver]`.
+
+    Returns
+    -------
+    (dict, dict of str to dict, dict)
+        `[receiver]`; the tables such as `[axis.z]` by axis; the file's other tables, with the keys of `[axis]` itself.
+
+    Raises
+    ------
+    ReceiverError
+        If it cannot be read, or has no such table.
+    """
+    others = load_tables(path)
+    table = others.pop("receiver", None)
     if not isinstance(table, dict):
         raise ReceiverError(f"{path}: receiver: missing, expected a table [receiver]")
-    axis = tables.get("axis")
-    named = [name for name, one in axis.items() if isinstance(one, dict)] if isinstance(axis, dict) else []
-    if named:
-        raise ReceiverError(f"{path}: axis.{named[0]}: this program applies one axis; several need load_any")
-    return settings_from(table, source=str(path), folder=path.parent), tables
+    axis = others.get("axis")
+    axes = {name: one for name, one in axis.items() if isinstance(one, dict)} if isinstance(axis, dict) else {}
+    if axes:
+        others["axis"] = {key: value for key, value in others["axis"].items() if key not in axes}
+        if not others["axis"]:
+            del others["axis"]
+    return table, axes, others
 
 
 def read_file(path: Path, most: int) -> bytes:

@@ -8,6 +8,7 @@ from .axis_message import AxisMessage
 from .limits import ToolLimits
 from .modes import ARRIVED_UM
 from .reasons import Reason
+from .values import finite, shown
 
 
 class Levers:
@@ -31,10 +32,13 @@ class Levers:
             return []
         if length_mm is None:
             return [Reason("no_tool_length")]
+        number = finite(length_mm)
+        if number is None and not isinstance(length_mm, float):
+            return [Reason("no_tool_length", f"{shown(length_mm)}, expected a number")]
         least, most = self._limits.length_min_mm, self._limits.length_max_mm
-        if not least <= length_mm <= most:  # not for NaN either
+        if number is None or not least <= number <= most:
             return [Reason("tool_length_beyond", f"{length_mm:g} mm, expected {least:g} to {most:g}")]
-        self._length_mm = length_mm
+        self._length_mm = number
         return []
 
     def follow(self, tilt: AxisMessage, angle_urad: float) -> tuple[float, float]:

@@ -92,6 +92,8 @@ class _Reader:
         self._measured = (-1, math.nan)
         #: Values of further axes in the last estimate of a machine of several.
         self._of_axes: tuple[int, dict[str, Any]] = (-1, {})
+        #: Offsets of further axes that come before that of Y with the same number.
+        self._further: list[AxisOffset] = []
         self._episode: Episode | None = None
         self._numbers = count()
         self._effects: list[str] = []
@@ -206,6 +208,11 @@ class _Reader:
             self._extend("", (), self._last_s, first)
         history.in_force.setdefault(offset.model_sha256, Stretches()).add(first, t)
         self._extend(offset.state, tuple(offset.reasons), first, t)
+        for one in self._further:
+            if one.seq == offset.seq and one.state != offset.state:
+                history.apart.setdefault((one.axis, one.state), Stretches()).add(first, t)
+                history.apart_seconds[one.axis, one.state] += t - first
+        self._further = []
         self._last_s = t
         for period in (history.whole, self._day(t)):
             period.seconds[offset.state] += t - first
@@ -216,7 +223,8 @@ class _Reader:
 
     def _axes(self, offsets: RecordedOffsets) -> None:
         """Add the offsets of further axes."""
-        for offset in offsets.messages():
+        self._further = offsets.messages()
+        for offset in self._further:
             self._axis(offset)
 
     def _axis(self, offset: AxisOffset) -> None:

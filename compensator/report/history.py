@@ -6,7 +6,7 @@ import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
-from compensator.codes import RecordingEnd
+from compensator.codes import RecordingEnd, State
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.story import Story
 
@@ -14,6 +14,8 @@ from compensator.report.story import Story
 EVENTS, EPISODES = 500, 200
 #: Number of the last probes that are kept; a probe every ten minutes for two weeks.
 PROBES = 2000
+#: States in which the offset follows the machine.
+FOLLOWED = (State.OK, State.DEGRADED)
 #: Shown as a state: the service did not run.
 NO_RECORDING = "no recording"
 
@@ -224,6 +226,8 @@ class History:
         `axis NAME offset`, `axis NAME measured`, `axis NAME left`.
     axis_reasons : dict of str to collections.Counter
         Number of samples with each reason, by the same names.
+    apart, apart_seconds : dict of (str, str) to Stretches, float
+        When a further axis was in another state than Y, and for how long, s, by axis and state.
     """
 
     machine: str = ""
@@ -248,6 +252,8 @@ class History:
     story: Story = field(default_factory=Story)
     axes: dict[str, Period] = field(default_factory=dict)
     axis_reasons: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    apart: dict[tuple[str, str], Stretches] = field(default_factory=dict)
+    apart_seconds: defaultdict[tuple[str, str], float] = field(default_factory=lambda: defaultdict(float))
 
     @property
     def first_s(self) -> float:

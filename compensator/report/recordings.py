@@ -16,6 +16,7 @@ from compensator.report.envelope import line_of
 from compensator.report.history import (
     EPISODES,
     EVENTS,
+    FOLLOWED,
     NO_RECORDING,
     PROBES,
     Episode,
@@ -42,14 +43,12 @@ from compensator.report.page import (
     Words,
     warnings_of,
 )
-from compensator.report.several import axis_blocks, figures_of_axes
+from compensator.report.several import axis_blocks, figures_of_axes, strips_apart, unfollowed
 from compensator.report.several import in_words as axes_in_words
 from compensator.report.story import figures_of, in_words, story_section
 
 #: Order of the states on the page.
 STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT, NO_RECORDING)
-#: States in which the offset follows the machine.
-_FOLLOWS = (State.OK, State.DEGRADED)
 #: Share of the time without a following offset (or degraded) above which the verdict is worse.
 _MUCH = 0.1
 #: A remaining error beyond this multiple of the stated standard deviation is attributed to the model or a sensor.
@@ -89,7 +88,7 @@ def page_of(history: History) -> Page:
         *_story(history),
         _band(history),
         _figures(history),
-        *axis_blocks(history, _curves),
+        *axis_blocks(history, _curves, _in_zone("last", history)),
         _states(history),
     ]
     if history.reasons:
@@ -148,7 +147,7 @@ def verdict(history: History) -> str:
     """Return the result in one sentence."""
     whole, seconds = history.whole, history.whole.seconds
     total = sum(seconds.values())
-    followed = sum(seconds[state] for state in _FOLLOWS)
+    followed = sum(seconds[state] for state in FOLLOWED)
     # "All" only if nothing is missing.
     share = "all" if followed == total else f"{min(100.0 * followed / total, 99.9):.1f} %"
     words = f"The offset followed the machine for {share} of {_hours(total)}"
@@ -193,7 +192,7 @@ def _short(value_um: float) -> str:
 def _tone(history: History) -> Tone:
     seconds = history.whole.seconds
     total = sum(seconds.values())
-    without = total - sum(seconds[state] for state in _FOLLOWS)
+    without = total - sum(seconds[state] for state in FOLLOWED) + max(unfollowed(history).values(), default=0.0)
     worse = history.whole.left.samples and history.whole.left.rms > history.whole.measured.rms
     if State.FAULT in history.states or without > _MUCH * total or worse:
         return "bad"
@@ -270,6 +269,7 @@ def _band(history: History) -> Figure:
         for state in STATES
         if state in history.states
     ]
+    strips += strips_apart(history)
     strips += [Strip(reason, tuple(stretch.pieces), 3) for reason, stretch in history.reasons.items()]
     if history.events:
         strips.append(Strip("events", tuple((t, t) for t, _, _ in history.events), 4))
@@ -436,7 +436,9 @@ def _states(history: History) -> Table:
             meaning, action = explain(state) or ("The service did not run.", "See the events before and after.")
             cell: Cell = state if state == NO_RECORDING else CodeLink(state)
             rows.append([cell, _minutes(seconds), _share(history, state), str(times), meaning, action])
-    return Table(title="Time in each state", rows=rows, head=["state", "min", "share", "times", "meaning", "action"])
+    head = ["state", "min", "share", "times", "meaning", "action"]
+    note = "The state of Y." if history.axes else ""
+    return Table(title="Time in each state", rows=rows, head=head, note=note)
 
 
 def _reasons(history: History) -> Table:

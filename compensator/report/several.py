@@ -7,11 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 from compensator.axes import label_of
+from compensator.codes import State
 from compensator.messages_axes import SHOWN_UNITS, UNITS
-from compensator.report.figure import Figure
-from compensator.report.history import History, Period
+from compensator.report.figure import Figure, Strip
+from compensator.report.history import FOLLOWED, History, Period
+from compensator.report.local_time import shown
 from compensator.report.notation import plain, signed
-from compensator.report.page import Block, Table
+from compensator.report.page import Block, Cell, CodeLink, Table
 
 
 def unit_of(name: str) -> str:
@@ -38,7 +40,7 @@ def title_of(name: str) -> str:
     return f"tilt {name.upper()}" if unit_of(name) == "µrad" else label_of(name)
 
 
-def axis_blocks(history: History, curves: Callable[..., Figure]) -> list[Block]:
+def axis_blocks(history: History, curves: Callable[..., Figure], last: str) -> list[Block]:
     """Return a table of all further axes and a figure of each; nothing for a machine with Y alone.
 
     Parameters
@@ -47,6 +49,8 @@ def axis_blocks(history: History, curves: Callable[..., Figure]) -> list[Block]:
         History read from the recordings.
     curves : callable
         Draws curves of the history: title, label, names with their curves.
+    last : str
+        Head of a column with the last time, with its zone.
     """
     if not history.axes:
         return []
@@ -63,12 +67,13 @@ def axis_blocks(history: History, curves: Callable[..., Figure]) -> list[Block]:
     ]
     note = "Measured, remaining and residual only where the axis has a displacement sensor. Y is above."
     blocks: list[Block] = [Table(title="Further axes", head=head, rows=rows, note=note)]
+    blocks += _states_apart(history, last)
     for name, figures in history.axes.items():
-        shown = {"offset": f"axis {name} offset"}
+        drawn = {"offset": f"axis {name} offset"}
         if figures.left.samples:
-            shown = {"measured": f"axis {name} measured", "remaining": f"axis {name} left"} | shown
+            drawn = {"measured": f"axis {name} measured", "remaining": f"axis {name} left"} | drawn
         title = title_of(name)
-        blocks.append(curves(history, f"Offset: {title}", f"{title}, {unit_of(name)}", shown))
+        blocks.append(curves(history, f"Offset: {title}", f"{title}, {unit_of(name)}", drawn))
     return blocks
 
 
@@ -79,7 +84,39 @@ def in_words(history: History) -> str:
         for name, figures in history.axes.items()
         if figures.left.samples
     ]
+    found += [
+        f"; {title_of(axis)} did not follow for {seconds / 60.0:.0f} min of it"
+        for axis, seconds in unfollowed(history).items()
+    ]
     return "".join(found)
+
+
+def unfollowed(history: History) -> dict[str, float]:
+    """Return for how long each further axis did not follow the machine while Y was in another state, s."""
+    found: dict[str, float] = {}
+    for (axis, state), seconds in history.apart_seconds.items():
+        if state not in FOLLOWED:
+            found[axis] = found.get(axis, 0.0) + seconds
+    return found
+
+
+def strips_apart(history: History) -> list[Strip]:
+    """Return when each further axis was in another state than Y."""
+    return [
+        Strip(f"{title_of(axis)}: {state}", tuple(history.apart[axis, state].pieces), 1 if state == State.OK else 0)
+        for axis, state in sorted(history.apart)
+    ]
+
+
+def _states_apart(history: History, last_at: str) -> list[Block]:
+    rows: list[list[Cell]] = []
+    for axis, state in sorted(history.apart):
+        stretches, seconds = history.apart[axis, state], history.apart_seconds[axis, state]
+        last = shown(stretches.pieces[-1][1])
+        rows.append([title_of(axis), CodeLink(state), f"{seconds / 60.0:.0f}", str(stretches.count), last])
+    head = ["axis", "state", "min", "times", last_at]
+    title = "Where an axis was in another state than Y"
+    return [Table(title=title, head=head, rows=rows)] if rows else []
 
 
 def figures_of_axes(history: History) -> dict[str, Any]:
@@ -91,10 +128,16 @@ def figures_of_axes(history: History) -> dict[str, Any]:
             "measured_rms": _null(figures.measured.rms),
             "left_rms": _null(figures.left.rms),
             "residual_rms": _null(figures.residual.rms),
+            **_minutes_apart(history, name),
         }
         for name, figures in history.axes.items()
     }
     return {"axes": found} if found else {}
+
+
+def _minutes_apart(history: History, name: str) -> dict[str, Any]:
+    own = {state: round(s / 60.0, 1) for (axis, state), s in history.apart_seconds.items() if axis == name}
+    return {"minutes_unlike_y": own} if own else {}
 
 
 def _row(name: str, figures: Period) -> list[Any]:

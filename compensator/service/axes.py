@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from compensator.arrays import NAN
 from compensator.axes import FIRST, column_of
 from compensator.config_axes import TILTS, Axes
@@ -212,14 +214,20 @@ class FurtherOutputs:
         ]
         return max(means, default=0.0)
 
+    def refer(self, predictions: list[OutputPrediction], measured: Mapping[str, float]) -> None:
+        """Take the first value of an axis that was not measured at the zero as its reference.
+
+        Its residual then starts at zero.
+        """
+        for one, predicted in zip(self.planned, predictions, strict=True):
+            state = self.states[one.name]
+            if math.isnan(state.ref) and one.column in measured:
+                state.ref = one.sign * measured[one.column] - predicted.value
+
     def values(
         self, estimate: Estimate | None, predictions: list[OutputPrediction], measured: Mapping[str, float]
     ) -> dict[str, float | list[float] | None]:
-        """Return what the estimate's message says of the further outputs, by name.
-
-        An axis whose measured value was missing at the zero has its first one as the reference: the residual starts at
-        zero.
-        """
+        """Return what the estimate's message says of the further outputs, by name."""
         found: dict[str, float | list[float] | None] = {}
         nothing = OutputEstimate(NAN, NAN, (), NAN, NAN, NAN)
         own = estimate.outputs if estimate is not None else ()
@@ -230,8 +238,6 @@ class FurtherOutputs:
             found[base], found[pred], found[std] = state.base, predicted.value, predicted.std
             if one.column in measured:
                 value = one.sign * measured[one.column]
-                if math.isnan(state.ref):
-                    state.ref = value - predicted.value
                 found[ref], found[since] = state.ref, value - state.ref
                 found[residual] = value - state.ref - predicted.value
         return found
@@ -248,6 +254,8 @@ def _constants(axes: Axes, axis: str) -> dict[str, Any]:
         found |= {"acts_on": tilt.acts_on or TILTS[axis], "reference_mm": tilt.reference_mm}
     if linear is not None and linear.slope is not None:
         found["reference_mm"] = linear.slope.reference_mm
+    if linear is not None and linear.sign != 1:
+        found["sign"] = linear.sign
     return found
 
 
@@ -274,7 +282,7 @@ def axis_message(offset: Offset, axis: str, outputs: FurtherOutputs, slope: Slan
     slope : Slanted, optional
         Slope of the axis.
     """
-    fields = {name: getattr(offset, name) for name in offset.__struct_fields__} | outputs.constants(axis)
+    fields = msgspec.structs.asdict(offset) | outputs.constants(axis)
     if slope is not None:
         fields |= {
             "y_slope_um_per_m": slope.value,

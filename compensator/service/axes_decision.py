@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import msgspec
+
 from compensator.arrays import NAN
 from compensator.axes import FIRST
 from compensator.codes import Reason, State, worst_state
@@ -135,5 +137,4 @@ def _with(offset: Offset, slope: Decision) -> Offset:
     """Return the offset of an axis with the worse state of it and its slope, and the reasons of both."""
     state = worst_state([offset.state, slope.state])
     reasons = list(dict.fromkeys([*offset.reasons, *slope.reasons]))
-    fields = {name: getattr(offset, name) for name in offset.__struct_fields__}
-    return type(offset)(**{**fields, "state": state, "reasons": reasons})
+    return msgspec.structs.replace(offset, state=state, reasons=reasons)

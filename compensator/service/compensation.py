@@ -386,6 +386,8 @@ class Compensation:
         if math.isnan(self._zero.y_ref) and estimate is not None:
             # The probe was missing at the zero: with this reference the residual starts at zero.
             self._zero.y_ref = values.y - y_pred
+        predictions = self.outputs.predictions(estimate)
+        self.outputs.refer(predictions, values.others)
         if self.plausibility.is_on:
             notes += self.plausibility.update(self._evidence(raw, values, prediction))
         condition = self._decision.condition(values, estimate is not None, self._memory, self.plausibility, self._jumps)
@@ -399,7 +401,6 @@ class Compensation:
         axes: dict[str, float | list[float] | None] | None = None
         further: tuple[AxisOffset, ...] = ()
         if self._further is not None:
-            predictions = self.outputs.predictions(estimate)
             axes = self.outputs.values(estimate, predictions, values.others)
             offset, *others = self._further.decide(
                 offset, condition, values, predictions if estimate else None, self._jumps.doubts

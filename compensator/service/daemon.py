@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
 from msgspec.structs import replace as replace_fields
 
 from compensator import __version__
@@ -426,8 +427,7 @@ class Daemon:
         if outcome.further:
             axes = {one.axis: AxisState(state=one.state, reasons=one.reasons) for one in outcome.further}
             axes[FIRST] = AxisState(state=outcome.offset.state, reasons=outcome.offset.reasons)
-            own = {name: getattr(status, name) for name in status.__struct_fields__}
-            status = AxesStatus(**own, axes={name: axes[name] for name in self._compensation.outputs.names})
+            status = AxesStatus(**asdict(status), axes={name: axes[name] for name in self._compensation.outputs.names})
         loop = self._loop.status() if self._loop is not None else None
         if loop is not None:
             status = replace_fields(status, loop=loop)

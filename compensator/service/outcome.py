@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
+
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.events import Note
@@ -109,4 +111,4 @@ def estimate_message(
     )
     if axes is None:
         return own
-    return AxesEstimate(**{name: getattr(own, name) for name in own.__struct_fields__}, axes=axes)
+    return AxesEstimate(**msgspec.structs.asdict(own), axes=axes)

@@ -19,12 +19,13 @@ from compensator.bridge.opcua import AxesBridge
 from compensator.bridge.register import AxesRegisters, AxisPlace
 from compensator.cli import main
 from compensator.errors import ConfigError
-from compensator.receiver import AxesFollower, AxesReceiver, AxesSettings, AxisLimits, ControlState
+from compensator.receiver import AxesFollower, AxesReceiver, AxesSettings, ControlState
 from compensator.receiver.applied_record import applied_at
 from compensator.receiver.limits import Acceptance
 from tests.bridge.plc import Plc
-from tests.bridge.test_opcua import until
+from tests.bridge.test_opcua import refused, until
 from tests.fuzz.mutation import mutated
+from tests.receiver.limits import MAX_UM, plain, sloped
 from tests.receiver.offsets import MACHINE, axis_offset, slope
 from tests.receiver.wire import ScriptedService, free_port, router
 
@@ -125,9 +126,9 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
     async def following() -> bool:
         return said[-1] == "following"
 
-    def publish(seq: int, y: float, z: float, um_per_m: float, without: str = "") -> None:
+    def publish(seq: int, y: float, z: float, um_per_m: float, without: str = "", **own: Any) -> None:
         line = slope(um_per_m, 100.0)
-        service.put_axes(seq, without=without, y={"value": y, **line}, z=z, a=20.0)
+        service.put_axes(seq, without=without, y={"value": y, **line, **own}, z={"value": z, **own}, a=20.0)
 
     with router(zenoh), ScriptedService(zenoh) as service:
         async with plc, bridging(path, said) as bridge:
@@ -170,6 +171,8 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
             await until(lambda: says("[plc_beyond_limit]"), "no slope")
             await plc.slope.write_value(0.0)
             await until(lambda: holds(-13.0, -4.0, -20.0), "it goes on")
+            publish(5, 10.0, -4.0, 20.0, sign=-1)  # turned by the service as well; Z is turned by nobody else
+            await until(lambda: says("in effect neither does. (y) [signs_cancel]"), "both signs")
 
 
 @pytest.mark.parametrize(
@@ -192,10 +195,7 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
 def test_it_does_not_start_like_this(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, expected: str
 ) -> None:
-    path = written(tmp_path, **{old: new})
-    assert main(["bridge", "opcua", "--config", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert expected in error and str(path) in error and error.count("\n") == 1
+    assert expected in refused(written(tmp_path, **{old: new}), capsys)
 
 
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
@@ -228,16 +228,7 @@ def test_check_names_each_axis(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 # ---------------------------------------------------------------------- against a PLC that does as it likes
 
-MOST_UM, RATE, STEP_S = 50.0, 60.0, 2.0
-PLAIN = AxisLimits(offset_max_um=MOST_UM, offset_rate_max_um_per_min=RATE)
-SLOPED = AxisLimits(
-    offset_max_um=MOST_UM,
-    offset_rate_max_um_per_min=RATE,
-    slope_max_um_per_m=60.0,
-    position_min_mm=0.0,
-    position_max_mm=1000.0,
-    position_speed_max_mm_per_s=500.0,
-)
+RATE, STEP_S = 60.0, 2.0
 PLACES = {
     "y": AxisPlace(sign=-1, per_um=1e-3, per_slope=1e-6, reference_mm=200.0, tolerance_um=0.1, travel_mm=1000.0),
     "z": AxisPlace(sign=1, per_um=1e-3, tolerance_um=0.1),
@@ -255,7 +246,7 @@ actions = st.one_of(
 def test_no_write_is_further_from_what_the_plc_holds_than_the_rate_allows_at_any_position(
     single: bool, steps: list[tuple[str, Any]]
 ) -> None:
-    f = AxesFollower(MACHINE, {"y": SLOPED, "z": PLAIN}, None, Acceptance(step_max_s=STEP_S))
+    f = AxesFollower(MACHINE, {"y": sloped(RATE), "z": plain(RATE)}, None, Acceptance(step_max_s=STEP_S))
     registers = AxesRegisters(f, PLACES, 5.0)
     registers.single = [single] * 3
     plc, now, seq = (0.001, 0.0, -0.002), 0.0, 0
@@ -279,7 +270,7 @@ def test_no_write_is_further_from_what_the_plc_holds_than_the_rate_allows_at_any
         for position_mm in (0.0, 640.0, 1000.0):
             was, wanted = (v[0] * 1e3 + v[1] * 1e6 * (position_mm - 200.0) / 1000.0 for v in (plc, values))
             # What the PLC holds may be off by the tolerances of both and still be ours.
-            assert abs(wanted - was) <= RATE / 60.0 * STEP_S + 0.2 + 1e-4 and abs(wanted) <= MOST_UM + 1e-4
+            assert abs(wanted - was) <= RATE / 60.0 * STEP_S + 0.2 + 1e-4 and abs(wanted) <= MAX_UM + 1e-4
         assert abs(values[2] - plc[2]) * 1e3 <= RATE / 60.0 * STEP_S + 0.1 + 1e-4
         if what == "refused":
             registers.lost("refused")

@@ -68,6 +68,14 @@ async def until(condition: Callable[[], Awaitable[Any]], what: str, timeout_s: f
         await asyncio.sleep(0.02)
 
 
+def refused(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the one line with which a bridge refuses its settings."""
+    assert main(["bridge", "opcua", "--config", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert str(path) in error and error.count("\n") == 1
+    return error
+
+
 @asynccontextmanager
 async def bridging(path: Path, said: list[str]) -> AsyncIterator[Bridge]:
     settings, opcua = load_bridge(path)
@@ -203,10 +211,7 @@ async def _near(plc: Plc, um: float) -> bool:
 def test_it_does_not_start_like_this(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, expected: str
 ) -> None:
-    path = written(tmp_path, **{old: new})
-    assert main(["bridge", "opcua", "--config", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert expected in error and str(path) in error and error.count("\n") == 1
+    assert expected in refused(written(tmp_path, **{old: new}), capsys)
 
 
 def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,10 +54,12 @@ MACHINE = (
     .replace("/var/lib/compensator/vmc-07/", "")
     .replace("192.168.10.22", "127.0.0.1")
 )
+AXES = (ROOT / "deploy/receiver/receiver_axes.example.toml").read_text(encoding="utf-8").replace(":7447", ":{port}")
 COMMAND = ["-m", "compensator"]
 PROGRAMS = {
     "receiver": (["-m", "compensator.receiver", "--config", "file.json5"], RECEIVER),
     "follow.py": ([str(ROOT / "deploy/receiver/follow.py"), "file.json5"], RECEIVER),
+    "follow_axes.py": ([str(ROOT / "deploy/receiver/follow_axes.py"), "file.json5"], AXES),
     "run": ([*COMMAND, "run", "--config", "file.json5"], MACHINE),
     "bridge opcua": ([*COMMAND, "bridge", "opcua", "--config", "file.json5"], RECEIVER + OPCUA),
     "bridge probes": ([*COMMAND, "bridge", "probes", "--config", "file.json5"], PROBES),

@@ -64,7 +64,7 @@ class AxesAttack:
         )
         tool = ToolLimits(length_min_mm=20.0, length_max_mm=400.0, length_from="zenoh")
         self.settings = AxesSettings(source=source, axes=LIMITS, tool=tool)
-        self.position_mm: float | None = 100.0
+        self.position_mm: Any = 100.0
         self.used_seq: int | None = None
         self.located_s = 0.0
         self.begin({"y": rng.uniform(-MAX_UM, MAX_UM), "z": 0.0})
@@ -101,7 +101,7 @@ class AxesAttack:
             assert all(abs(um) <= MAX_UM + 1e-9 for um in (one.offset_um, *one.ends_um))
             assert one.reasons or one.state not in ("starting", "holding")
         assert len((applied.text + applied.steady_reasons).encode()) < 100_000
-        if self.position_mm is not None and math.isfinite(self.position_mm):
+        if isinstance(self.position_mm, float) and math.isfinite(self.position_mm):
             self.located_s = self.now_s
         self.applied_um, self.slope = {axis: one.offset_um for axis, one in applied.axes.items()}, y.slope_um_per_m
         return applied
@@ -139,7 +139,7 @@ class AxesAttack:
             if self.rng.randrange(3) == 0:
                 self.send_sample()
             places = (self.rng.uniform(0.0, TRAVEL_MM), self.rng.uniform(-1e9, 1e9), math.nan, math.inf, None, 100.0)
-            self.position_mm = self.rng.choice(places)
+            self.position_mm = self.rng.choice((*places, "100", [100.0], 10**400))
             self.poll(self.rng.choice((0.0, 0.1, 0.5, 20.0, 61.0, 700.0)))
             if self.rng.randrange(10) == 0:
                 self.honest()

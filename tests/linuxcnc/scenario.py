@@ -25,7 +25,7 @@ import zenoh
 from compensator.demo.machine import configuration, hardware
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.linuxcnc.control import SHIPPED, Control, Period, changed, linuxcnc
-from tests.linuxcnc.several import axes
+from tests.linuxcnc.several import axes, service_axes
 from tests.receiver.wire import ScriptedService, router, until
 
 PORT = 7447
@@ -504,7 +504,6 @@ def refused(folder: Path) -> None:
 if __name__ == "__main__":  # NAME FOLDER
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     place = Path(sys.argv[2])
-    {"scripted": scripted, "service": service, "probing": probing, "refused": refused, "axes": axes}[sys.argv[1]](
-        place / "control"
-    )
+    scenarios = (scripted, service, probing, refused, axes, service_axes)
+    {one.__name__: one for one in scenarios}[sys.argv[1]](place / "control")
     print("done", flush=True)

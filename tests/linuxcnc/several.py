@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tests.linuxcnc.control import SHIPPED, Control, changed, linuxcnc
 from tests.receiver.offsets import slope
 from tests.receiver.wire import ScriptedService, router, until
+from tests.soak.axes_site import FREE, GAUGE_MM, PERIOD_S, RATES, Axes, AxesSite, levers
+from tests.soak.site import end
 
 SAMPLER = """
 loadrt sampler depth=8192 cfg=ffffff
@@ -69,13 +73,14 @@ def smooth(periods: Sequence[Joints]) -> None:
 
 
 class Bench:
-    """A control with three axes."""
+    """A control with three axes, and the service that says what the test says, if that is not the real one."""
 
-    def __init__(self, control: Control, service: ScriptedService) -> None:
+    def __init__(self, control: Control, service: ScriptedService | None = None) -> None:
         self.control, self.service = control, service
         self.seq = 0
 
     def put(self, x: float, y: float, z: float, *, without: str = "") -> None:
+        assert self.service is not None
         self.seq += 1
         angle: dict[str, Any] = {"value": ANGLE, "reference_mm": REFERENCE_MM}
         self.service.put_axes(self.seq, without=without, x=x, y={"value": y, **slope(SLOPE)}, z=z, a=angle)
@@ -83,22 +88,32 @@ class Bench:
     def pin(self, name: str) -> Any:
         return self.control.get(f"thermal-offset.{name}")
 
+    def offsets_um(self) -> dict[str, float]:
+        """What each joint is away from what is programmed."""
+        motors = [self.control.um(f"joint.{i}.motor-pos-cmd") for i in range(3)]
+        programs = [self.control.um(f"axis.{axis}.pos-cmd") for axis in AXES]
+        return {axis: motors[i] - programs[i] for i, axis in enumerate(AXES)}
+
     def arrive(self, **offsets_um: float) -> None:
         """Each joint is at what is programmed and its offset."""
+        self.follow(lambda: offsets_um)
+
+    def follow(self, wanted_um: Callable[[], Mapping[str, float]]) -> None:
+        """Each joint is at what is programmed and what is wanted then."""
 
         def off_um() -> dict[str, float]:
-            motors = [self.control.um(f"joint.{i}.motor-pos-cmd") for i in range(3)]
-            programs = [self.control.um(f"axis.{axis}.pos-cmd") for axis in AXES]
-            return {axis: motors[i] - programs[i] - offsets_um[axis] for i, axis in enumerate(AXES)}
+            found = self.offsets_um()
+            return {axis: found[axis] - um for axis, um in wanted_um().items()}
 
         until(
             lambda: self.pin("arrived") and all(abs(um) < NEAR_UM for um in off_um().values()),
-            lambda: f"{offsets_um}, off by {off_um()}, Y goes to {self.pin('y.offset-um')}",
+            lambda: f"off by {off_um()}, Y goes to {self.pin('y.offset-um')}",
         )
 
 
-def axes(folder: Path) -> None:
-    """From the samples to three joints."""
+@contextmanager
+def machine(folder: Path) -> Iterator[tuple[Control, Path]]:
+    """A control with three axes and a tool table."""
     folder.mkdir(mode=0o777, exist_ok=True)
     (folder / "tool.tbl").write_text(TABLE, encoding="utf-8")
     ini = {
@@ -107,11 +122,13 @@ def axes(folder: Path) -> None:
         "[AXIS_X]\n": "[AXIS_X]\nOFFSET_AV_RATIO = 0.01\n",
         "[AXIS_Z]\n": "[AXIS_Z]\nOFFSET_AV_RATIO = 0.01\n",
     }
-    with (
-        router(PORT),
-        ScriptedService(PORT) as service,
-        linuxcnc(folder, settings(), sampler=SAMPLER, read=Joints.read, **ini) as (control, log),
-    ):
+    with linuxcnc(folder, settings(), sampler=SAMPLER, read=Joints.read, **ini) as started:
+        yield started
+
+
+def axes(folder: Path) -> None:
+    """From the samples to three joints."""
+    with router(PORT), ScriptedService(PORT) as service, machine(folder) as (control, log):
         bench = Bench(control, service)
         with control.watched() as periods:
             _start(bench)
@@ -185,3 +202,67 @@ def _program(bench: Bench) -> None:
         until(lambda: not bench.control.do("running"), "the program's end")
         bench.arrive(x=1.0, y=3.0, z=4.0)
     smooth(periods)
+
+
+# ---------------------------------------------------------------------- the service itself
+
+
+def service_axes(folder: Path) -> None:
+    """The real service of five outputs moves three joints, with a tool change, a moved table and a kill."""
+    endpoint = f"tcp/127.0.0.1:{PORT}"
+    with (
+        router(PORT),
+        Axes("shop/vmc-07", mode="client", connect__endpoints=[endpoint], connect__timeout_ms=10_000) as heard,
+        AxesSite(folder.parent, dict.fromkeys(RATES, FREE), connect=[endpoint], period_s=PERIOD_S) as site,
+        machine(folder) as (control, log),
+    ):
+        bench = Bench(control)
+
+        def follow(y_mm: float, tool_mm: float) -> None:
+            def wanted() -> dict[str, float]:
+                seq = heard.newest()
+                return heard.wanted_um(seq, levers(y_mm, tool_mm), time.monotonic() - heard.came_s[seq])
+
+            bench.follow(wanted)
+
+        process = site.start()
+        try:
+            until(lambda: abs(heard.whole.get(heard.newest(), {}).get("z_offset_um", 0.0)) > 1.0, "an offset", 90.0)
+            control.do("states", "ESTOP_RESET")
+            control.do("states", "ON")
+            control.do("home")
+            control.do("teleop")
+            control.do("mdi", "G0 X0 Y0 Z0")
+            with control.watched() as periods:
+                follow(0.0, GAUGE_MM)
+                control.do("mdi", "T1 M6 G43")
+                follow(0.0, TOOL_MM)
+                control.do("mdi", "G0 Y90")
+                follow(90.0, TOOL_MM)
+                end(process)  # kill −9
+                until(lambda: not bench.pin("alive") and bench.pin("state") == 2, "it holds")
+                held = stands(bench)
+                time.sleep(1.0)
+                assert bench.offsets_um() == held
+                process = site.start()
+                until(lambda: bench.pin("alive") and bench.pin("fresh"), "it goes on")
+                follow(90.0, TOOL_MM)
+            smooth(periods)
+        finally:
+            end(process)
+        text = log.read_text(errors="replace")
+        assert "thermal-offset: following" in text and "Traceback" not in text, text
+        assert not [line for line in control.do("failures") if "joint" in line.lower()]
+
+
+def stands(bench: Bench) -> dict[str, float]:
+    """Wait until the axes stand; a last change may still be on its way to the control."""
+    seen = [bench.offsets_um()]
+
+    def still() -> bool:
+        time.sleep(0.2)
+        seen.append(bench.offsets_um())
+        return seen[-1] == seen[-2]
+
+    until(still, "the axes stand")
+    return seen[-1]

@@ -45,7 +45,7 @@ def run_scenario(name: str, place: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
-@pytest.mark.parametrize("name", ["scripted", "axes", "service", "probing", "refused"])
+@pytest.mark.parametrize("name", ["scripted", "axes", "service", "service_axes", "probing", "refused"])
 def test_at_the_control(name: str, place: Path) -> None:
     done = run_scenario(name, place)
     assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stdout + done.stderr

@@ -21,19 +21,11 @@ from compensator.receiver import (
     ToolLimits,
 )
 from compensator.receiver.limits import Acceptance
+from tests.receiver.limits import MAX_UM, plain, sloped
 from tests.receiver.offsets import axis_offset, slope
 
-MACHINE, MAX_UM, RATE = "vmc-07", 50.0, 6.0
-PLAIN = AxisLimits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE)
-#: Y with a slope over a travel of a metre.
-SLOPED = AxisLimits(
-    offset_max_um=MAX_UM,
-    offset_rate_max_um_per_min=RATE,
-    slope_max_um_per_m=60.0,
-    position_min_mm=0.0,
-    position_max_mm=1000.0,
-    position_speed_max_mm_per_s=500.0,
-)
+MACHINE, RATE = "vmc-07", 6.0
+PLAIN, SLOPED = plain(RATE), sloped(RATE)
 TOOL = ToolLimits(length_min_mm=20.0, length_max_mm=400.0)
 
 
@@ -219,6 +211,29 @@ def test_hold_and_fade_are_of_all_axes() -> None:
     assert f.applied_um["z"] == 4.0
     with pytest.raises(ReceiverError, match="offset_max_um"):
         f.rebase("z", 50.1)
+    wrong: tuple[Any, ...] = ("1.0", None, [1.0], 10**400, math.nan)
+    for bad in wrong:
+        for changes in ({"applied_um": bad}, {"slope_um_per_m": bad}, {"at_mm": [] if bad is None else bad}):
+            with pytest.raises(ReceiverError, match="applied offset = "):
+                f.rebase("z", **{"applied_um": 1.0, **changes})
+
+
+@pytest.mark.parametrize(("published", "here", "said"), [(-1, -1, True), (-1, 1, False), (1, -1, False)])
+def test_an_axis_that_both_sides_turn_is_said(published: int, here: int, said: bool) -> None:
+    f = follower(y=PLAIN, z=AxisLimits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE, sign=here))
+    own = {"sign": published} if published != 1 else {}
+    assert sample(f, 0.0, 1, y=1.0, z={"value": 2.0, **own})
+    f.advance(0.0)
+    last = run(f, 0.0, 60.0)[-1]
+    assert um(last) == (1.0, 2.0 * here) and last.arrived  # it is said, not corrected: only a gauge knows
+    assert codes(last) == ({"signs_cancel"} if said else set()) and (not said or "(z) [signs_cancel]" in last.text)
+
+
+@pytest.mark.parametrize("sign", [0, 2, True, "1", None, [1]])
+def test_a_sign_that_is_none_drops_the_sample(sign: Any) -> None:
+    f = follower(y=PLAIN, z=PLAIN)
+    assert not sample(f, 0.0, 1, y=1.0, z={"value": 2.0, "sign": sign})
+    assert set(f.dropped) == {"malformed"}
 
 
 # ---------------------------------------------------------------------- tilt
@@ -270,15 +285,18 @@ def test_after_a_fade_nothing_moves_faster_whatever_tool_there_is() -> None:
         (0.0, "tool_length_beyond"),
         (math.nan, "tool_length_beyond"),
         (1e9, "tool_length_beyond"),
+        (10**400, "no_tool_length"),
+        ("250", "no_tool_length"),
+        (True, "no_tool_length"),
+        ([250.0], "no_tool_length"),
     ],
 )
-def test_without_a_length_the_offset_is_that_of_the_reference_and_this_is_said(
-    length_mm: float | None, code: str
-) -> None:
+def test_without_a_length_the_offset_is_that_of_the_reference_and_this_is_said(length_mm: Any, code: str) -> None:
     f = tilting()
     run(f, 30.0, 80.0, ControlState(tool_length_mm=250.0))
     last = run(f, 110.0, 80.0, ControlState(tool_length_mm=length_mm))[-1]
     assert um(last) == (2.0,) and codes(last) == {code} and last.state == "following"
+    assert len(last.text) < 300 and last.text.isprintable()
 
 
 def test_a_tool_that_is_changed_while_the_offset_is_held_moves_nothing_and_is_said() -> None:
@@ -319,7 +337,7 @@ def sloping() -> AxesFollower:
     return f
 
 
-def at(position_mm: float | None) -> ControlState:
+def at(position_mm: Any) -> ControlState:
     return ControlState(positions_mm={"y": position_mm})
 
 
@@ -363,7 +381,7 @@ def test_a_position_that_cannot_be_the_axis_motion_does_not_move_the_offset(jump
 
 def test_a_position_that_is_lost_or_outside_is_said() -> None:
     f = sloping()
-    for position in (None, math.nan, math.inf):
+    for position in (None, math.nan, math.inf, "300", True, 10**400):
         lost = f.advance(300.5, at(position))
         assert um(lost) == (4.0,) and codes(lost) == {"no_position"} and not lost.arrived
     assert um(f.advance(301.0, at(300.0))) == (pytest.approx(6.0),)
@@ -440,10 +458,12 @@ whole = st.builds(
 something = st.one_of(
     whole, st.lists(message, max_size=3), st.lists(st.tuples(st.sampled_from("yza"), st.binary(max_size=9)))
 )
+#: What a control's program may hand over by mistake.
+no_number = st.none() | st.sampled_from(["250", "", "\x1b", True, [1.0], {}, b"1", 1j, 10**400]) | st.text(max_size=9)
 control = st.builds(
     ControlState,
-    tool_length_mm=st.one_of(st.none(), st.floats(20.0, 400.0), st.floats(), st.sampled_from([100.0, 250.0])),
-    positions_mm=st.fixed_dictionaries({"y": st.one_of(st.none(), st.floats(), st.floats(-50.0, 1050.0))}),
+    tool_length_mm=st.one_of(no_number, st.floats(20.0, 400.0), st.floats(), st.sampled_from([100.0, 250.0])),
+    positions_mm=st.fixed_dictionaries({"y": st.one_of(no_number, st.floats(), st.floats(-50.0, 1050.0))}),
     cutting=st.booleans(),
 )
 told = st.sampled_from(["", "", "", "", "follow", "follow", "hold", "fade"])
@@ -486,5 +506,5 @@ def test_no_axis_ever_jumps_or_leaves_its_limit(steps: list[Any]) -> None:
             assert z.offset_um == before.axes["z"].offset_um
         assert len(applied.text + applied.steady_reasons) < 10_000
         position = state.positions_mm["y"]
-        located_s = located_s if position is None or not math.isfinite(position) else now
+        located_s = now if isinstance(position, float) and math.isfinite(position) else located_s
         before = applied

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -123,7 +124,8 @@ def test_through_a_router_together_or_not_at_all(tmp_path: Path) -> None:
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
             try:
                 assert process.stdout is not None
-                assert process.stdout.readline().startswith("y +0.00, z +0.00 µm, starting")
+                # Starting, or the answer was there at once.
+                assert process.stdout.readline().startswith("y +0.00, z +0.00 µm, ")
                 assert any("following" in line for line in process.stdout)
             finally:
                 process.terminate()
@@ -153,6 +155,36 @@ def test_bad_settings_get_one_line(tmp_path: Path, old: str, new: str, expected:
         load_any(path)
     text = str(caught.value)
     assert expected in text and str(path) in text and "\n" not in text and text.count(str(path)) == 1
+
+
+def test_the_example_program_follows_a_service_with_the_shipped_settings(tmp_path: Path) -> None:
+    port, path = free_port(), tmp_path / "receiver.toml"
+    text = (ROOT / "deploy/receiver/receiver_axes.example.toml").read_text(encoding="utf-8")
+    path.write_text(text.replace("7447", str(port)).replace("min = 10.0", "min = 6000.0"), encoding="utf-8")
+    program = [sys.executable, str(ROOT / "deploy/receiver/follow_axes.py")]
+    with router(port), ScriptedService(port) as service:
+        y = {"value": -4.0, **slope(20.0, 300.0)}
+        service.put_axes(1, heard=False, x=1.0, y=y, z=-7.0, a=30.0)
+        with subprocess.Popen([*program, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            try:
+                # Nothing is read of a control: the tool is the reference, Y at the middle of its travel.
+                line = next(line for line in process.stdout if "x +1.00, y -4.00, z -7.00 µm, following" in line)
+                assert "[no_tool_length]" in line and "[no_position]" in line
+            finally:
+                process.send_signal(signal.SIGINT)
+                process.stdout.read()
+        assert process.returncode == 0
+    for name, expected in (("none.toml", "none.toml"), ("receiver.example.toml", "of Y alone: follow.py")):
+        done = subprocess.run(
+            [*program, str(ROOT / "deploy/receiver" / name)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 1 and done.stderr.count("\n") == 1 and expected in done.stderr
 
 
 def test_a_program_of_one_axis_refuses_a_file_of_several(tmp_path: Path) -> None:

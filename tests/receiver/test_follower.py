@@ -152,7 +152,8 @@ def test_rebase_goes_on_from_what_the_control_holds() -> None:
     f, t = settled(3.0)
     f.rebase(-7.0)
     assert f.advance(t + 1.0).offset_um == pytest.approx(-6.9)
-    for bad in (math.nan, math.inf, 50.1):
+    wrong: tuple[Any, ...] = (math.nan, math.inf, 50.1, "3.0", None, True, 10**400)
+    for bad in wrong:
         with pytest.raises(ReceiverError, match="offset_max_um"):
             f.rebase(bad)
         with pytest.raises(ReceiverError, match="offset_max_um"):

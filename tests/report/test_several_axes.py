@@ -16,12 +16,14 @@ from compensator.commands.run import status
 from compensator.data.export import export
 from compensator.data.measurement import read
 from compensator.messages_axes import OFFSETS
+from compensator.model.effects import effect_from
 from compensator.report.gathering import read_history
 from compensator.report.recordings import figures, page_of
 from compensator.watch.machine import WatchedMachine
 from compensator.watch.shop_recorder import ShopRecorder
 from compensator.watch.terminal import detail, line
-from tests.service.several import AXES, SLOPE, TILT, SeveralAxes, by_axis, config_text, model_text
+from drivers.reading import Quality, Reading
+from tests.service.several import AXES, SLOPE, TILT, SeveralAxes, by_axis, config_text, model_text, part
 
 PREFIX = "shop/vmc-07"
 
@@ -97,6 +99,35 @@ def test_the_page_has_figures_and_a_picture_of_every_axis(machine: SeveralAxes) 
     assert cells["tilt A"] == (f"rate_limited {limited}" if limited else "none")
     titles = [getattr(block, "title", "") for block in page_of(history).blocks]
     assert {"Further axes", "Offset: Z", "Offset: tilt A", "Offset: slope of Y"} <= set(titles)
+
+
+def test_where_an_axis_was_in_another_state_than_y_the_page_says_so(tmp_path: Path, machine: SeveralAxes) -> None:
+    effect = effect_from(
+        "input", {"channel": "coolant_degc", "curve": "linear", "tau_min": [9.0], "gain": [2.0], "delay_min": 0.0}
+    )
+    lost = SeveralAxes(tmp_path, config_text(AXES), model_text("y", "x", parts={"z": part("z", effect)}))
+
+    def without_coolant() -> None:
+        lost.device.replaced[3] = Reading.bad(Quality.OPEN, "open")
+
+    lost.run(90, {30: without_coolant, 50: lost.device.replaced.clear})
+    history = read_history(lost.recordings)
+    apart = [(axis, state, stretches.count) for (axis, state), stretches in history.apart.items()]
+    assert apart == [("z", "degraded", 1)] and history.apart_seconds["z", "degraded"] == 20 * 60.0
+    assert figures(history)["axes"]["z"]["minutes_unlike_y"] == {"degraded": 20.0}  # type: ignore[index]
+    page = page_of(history)
+    (table,) = [b for b in page.blocks if getattr(b, "title", "") == "Where an axis was in another state than Y"]
+    assert [row[0] for row in table.rows] == ["Z"] and table.rows[0][2:4] == ["20", "1"]  # type: ignore[union-attr]
+    (band,) = [b for b in page.blocks if getattr(b, "title", "") == "States and reasons"]
+    assert "Z: degraded" in [strip.name for strip in band.strips]  # type: ignore[union-attr]
+    assert "did not follow" not in page.verdict
+    # A machine whose axes go together shows none of it.
+    alike = page_of(read_history(machine.recordings))
+    assert not read_history(machine.recordings).apart and "another state than Y" not in str(alike.blocks)
+    # An axis that stood while Y followed is in the verdict.
+    history.apart_seconds["x", "hold"] = 720.0
+    assert "; X did not follow for 12 min of it" in page_of(history).verdict
+    assert page_of(history).tone == "bad"
 
 
 def test_the_watch_shows_every_axis(machine: SeveralAxes) -> None:

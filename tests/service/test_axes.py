@@ -29,7 +29,18 @@ from tests.audit import made
 from tests.audit.attacks import rechained_all
 from tests.audit.tampering import Line
 from tests.service.records import sample
-from tests.service.several import AXES, SENSORS, SLOPE, TILT, SeveralAxes, by_axis, config_text, model_text, part
+from tests.service.several import (
+    AXES,
+    LIMITS,
+    SENSORS,
+    SLOPE,
+    TILT,
+    SeveralAxes,
+    by_axis,
+    config_text,
+    model_text,
+    part,
+)
 
 EVERY = (AXES, TILT, SLOPE)
 PARTS = ("y", "x", "z", "low", "high", "y_slope")
@@ -165,6 +176,10 @@ def test_an_offset_that_is_missing_or_of_no_axis_is_found(day: SeveralAxes, tmp_
     difference = audit([path]).difference
     assert difference is not None
     assert difference.topic == "offsets"
+    # A line for each axis, not one of all.
+    assert [field.name for field in difference.fields] == [f"message of {axis}" for axis in "xza"]
+    assert all(field.recorded is None and field.recomputed["axis"] in field.name[-1] for field in difference.fields)
+    assert max(map(len, difference.lines())) < 600
 
 
 @pytest.mark.parametrize("topic", ["offsets", "offset", "estimate"])
@@ -185,6 +200,8 @@ def test_a_second_value_beside_the_true_one_is_found_though_the_chain_fits(
     rechained_all([path], doubled)
     found = audit([path])
     assert found.differing or found.findings_count, "passed"
+    if topic == "offsets" and found.difference is not None:
+        assert max(map(len, found.difference.lines())) < 600
 
 
 def test_y_is_what_it_is_without_the_other_axes() -> None:
@@ -257,6 +274,10 @@ def test_the_sense_of_a_control_is_that_of_its_offset_and_its_residual() -> None
     for one, other in zip(processed(plain, 90), processed(turned, 90), strict=True):
         assert by_axis(one)["z"].y_offset_um == -by_axis(other)["z"].y_offset_um
         assert one.estimate.axes["z_um"] == -other.estimate.axes["z_um"]  # type: ignore[attr-defined]
+    # Who applies it can see that it was turned; otherwise nothing is said.
+    assert json.loads(encode(by_axis(other)["z"]))["sign"] == -1
+    for offset in (by_axis(one)["z"], by_axis(other)["x"], by_axis(other)["y"]):
+        assert "sign" not in json.loads(encode(offset))
 
 
 def test_the_deviation_of_a_tilt_knows_that_its_probes_share_the_heat() -> None:
@@ -380,7 +401,11 @@ def test_a_checkpoint_beyond_the_limit_of_an_axis_is_not_used(tmp_path: Path) ->
         ((AXES.replace("offset_max_um = 150.0\n", ""),), "axis.z.offset_max_um: missing"),
         ((AXES.replace("150.0", "-1.0"),), "axis.z.offset_max_um = -1.0"),
         ((AXES.replace("150.0", "nan"),), "axis.z.offset_max_um = nan"),
-        ((AXES + "sign = 2\n",), "axis.z.sign = 2"),
+        ((AXES + "sign = 2\n",), "axis.z.sign = 2: expected one of: -1, 1"),
+        ((AXES + 'sign = "-1"\n',), "axis.z.sign = '-1': expected one of: -1, 1"),
+        ((AXES, TILT + 'acts_on = "w"\n'), "axis.a.acts_on = 'w': expected one of: x, y, z"),
+        ((AXES, '[loop]\npolicy = "maybe"\n'), "loop.policy = 'maybe': expected one of: off, propose, adopt"),
+        ((AXES, "[loop]\nevery_h = 5\n"), "loop.every_h = 5: expected one of: 4, 6, 8, 12, 24"),
         ((AXES, TILT.replace("reference_mm = 120.0", "reference_mm = 1e9")), "axis.a.reference_mm = 1000000000.0"),
         ((AXES, TILT.replace("distance_mm = 200.0", "distance_mm = 0.0")), "axis.a.distance_mm = 0.0"),
         ((AXES.replace("[axis.y]", "[axis.y]\nsign = -1"),), "axis.y.sign = -1: expected 1"),
@@ -389,7 +414,8 @@ def test_a_checkpoint_beyond_the_limit_of_an_axis_is_not_used(tmp_path: Path) ->
           TILT + 'acts_on = "x"\n'), "axis.a: acts on 'x', expected one of: y, z"),
         ((AXES, TILT.replace('"high"', '"low"')), "axis.a.probes"),
         ((AXES + 'part = "x"\n',), "axis.z.part = 'x': expected a part of its own, axis.x has this one"),
-        ((AXES.partition("[axis.x]")[2].join(["[axis.x]", ""]),), "axis.y: missing"),
+        ((AXES.partition("[axis.x]")[2].join(["[axis.x]", ""]),), "axis.y: missing; zero, checks and probes of"),
+        (("[axis.z]\n" + LIMITS,), "Where a single axis is corrected there is no [axis.*]: that axis is called Y"),
         ((AXES, '[loop]\npolicy = "propose"\n'), "loop.policy: expected 'off' with [axis.*]"),
     ],
 )  # fmt: skip

@@ -67,6 +67,11 @@ def test_the_check_names_the_axes_and_what_the_model_has_beyond(
     path, _ = machine
     assert main(["check", "--config", str(path)]) == 0
     assert "axes: x, y, z, a\n" in capsys.readouterr().out
+    plain = path.read_text(encoding="utf-8")
+    path.write_text(plain.replace("[axis.z]", "[axis.z]\nsign = -1"), encoding="utf-8")
+    assert main(["check", "--config", str(path)]) == 0
+    assert "axes: x, y, z, a; sign = -1 of z: the published offset is turned, so no rec" in capsys.readouterr().out
+    path.write_text(plain, encoding="utf-8")
     path.write_text(path.read_text(encoding="utf-8").replace(TILT, ""), encoding="utf-8")
     assert main(["check", "--config", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from compensator.messages import number
 from compensator.service.loop.job import Job, read_record
@@ -33,7 +34,7 @@ def test_probes_about_one_zero_are_diagnosed_those_of_which_there_are_most(zero_
                 loop.compensation.zero("warm")
             truth.append(number(one.channels["y_um"].mean) - (truth[zero_at] if i > zero_at else 0.0))
             channel = one.channels["y_um"]
-            one.channels["y_um"] = type(channel)(**{**_fields(channel), "mean": truth[-1]})
+            one.channels["y_um"] = replace(channel, mean=truth[-1])
             yield one
 
     steps = probed(loop, counted(), every)
@@ -44,10 +45,6 @@ def test_probes_about_one_zero_are_diagnosed_those_of_which_there_are_most(zero_
     zero_s = steps[zero_at].outcome.sample.time_utc_ns / 1e9
     assert np.all(at > zero_s) if zero_at < samples / 2 else np.all(at < zero_s)
     assert at.size == sum((probe.time_utc_ns / 1e9 > zero_s) == (zero_at < samples / 2) for probe in taken)
-
-
-def _fields(channel):
-    return {name: getattr(channel, name) for name in channel.__struct_fields__}
 
 
 async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(tmp_path: Path) -> None:
