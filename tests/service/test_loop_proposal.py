@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
 from compensator.service.loop.place import LEADS
 from compensator.service.loop.run import LoopRun, LoopStep
-from compensator.service.loop.state import RULE, LoopState, Place, decode_loop
 from compensator.service.transfer.comparison import DEVIATIONS
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
@@ -67,24 +63,6 @@ def test_a_proposal_stands_on_no_evidence_that_a_suspected_sensor_has_given() ->
     assert about_it(steps) == ["propose", "withdraw"]
     (text,) = (note.text for step in steps for note in step.events if "withdrawn" in note.text)
     assert text == "the proposal is withdrawn: a sensor is suspected, so what was compared does not count"
-
-
-def test_in_a_recording_of_the_rule_before_a_proposal_falls_when_it_is_shown_no_longer() -> None:
-    loop = LoopRun(settings(loop=PROPOSING), QUILL, Night(shown(extended())))
-    loop._core.state.rule = 2
-    ends = NIGHT + 60 * RIGHT_H
-    steps = run(loop, machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else 0.5, noise_um=1.5))
-    assert about_it(steps)[:2] == ["propose", "withdraw"]
-    loop._core.use_present_rule()
-    assert loop._core.state.rule == RULE
-
-
-def test_a_state_of_version_2_decides_by_its_rule() -> None:
-    place = Place(sha256="a" * 64, effects=[], role="candidate", since_utc_ns=7, is_proposed=True)
-    table = msgspec.to_builtins(LoopState(found=place))
-    del table["rule"]
-    read = decode_loop(json.dumps(table | {"schema": 2, "places": 2}).encode())
-    assert read.rule == 2 and read.found == place
 
 
 def test_a_proposal_whose_evidence_hovers_is_the_same_after_a_kill() -> None:

@@ -9,7 +9,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from unittest.mock import Mock
 
 import msgspec
@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
+from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
@@ -25,7 +26,6 @@ from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
 from compensator.service.loop import live
 from compensator.service.loop.core import ModelLoop
-from compensator.service.loop.earlier_rules import use_present_rule
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
@@ -140,19 +140,16 @@ def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
     assert len(a.candidates) == 2
 
 
-def watching(
-    verdict: ComparisonData, *, rule: Literal[1, 2, 3] = 3, hours: float = 30.0, misfit_h: float = 0.0
-) -> tuple[Loop, int]:
+def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 0.0) -> tuple[Loop, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
     now_ns = ADOPTED_NS + round(hours * HOUR_NS)
     before = Place(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
     state = LoopState(
-        rule=rule,
+        watched=before,
         adopted_utc_ns=ADOPTED_NS,
         misfit_min=60.0 * misfit_h,
         diagnosis=Running(from_utc_ns=ADOPTED_NS, to_utc_ns=now_ns, why="planned"),
     )
-    state.put("watched" if rule > 1 else "found", before)
     return Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
 
 
@@ -186,67 +183,10 @@ def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData,
     assert loop.state.phase == "shadow"
 
 
-@pytest.mark.parametrize(
-    ("hours", "verdict", "misfit_h", "other_waits", "same_waits"),
-    [
-        (100.0, judged(NOT_JUDGED), 0.0, True, True),
-        (100.0, judged(ALIKE, 0.5, 1.0), 0.0, False, True),
-        (23.9, judged(WORSE, -9.0, 3.0), 0.0, True, True),
-        (10.0, judged(WORSE, -9.0, 3.0), 3.0, False, False),
-        (10.0, judged(ALIKE, 2.5, 0.8), 3.0, True, True),
-    ],
-)
-def test_in_a_recording_with_one_place_a_candidate_waited(
-    hours: float, verdict: ComparisonData, misfit_h: float, *, other_waits: bool, same_waits: bool
-) -> None:
-    for same, waits in ((False, other_waits), (True, same_waits)):
-        loop, now_ns = watching(verdict, rule=1, hours=hours, misfit_h=misfit_h)
-        assert follows(loop, now_ns, same=same) == (("nothing", "waits") if waits else ("shadow", ""))
-        assert loop.state.found is not None and loop.state.found.sha256 == "a" * 64
-
-
-def of_version_1(state: LoopState) -> bytes:
-    """Return a state with one place as version 1 wrote it."""
-    table = msgspec.to_builtins(state)
-    found = table.pop("found")
-    for name in ("rule", "watched", "incoming"):
-        del table[name]
-    parts = {name: found.pop(name) for name in ("comparison", "verdict", "error", "is_proposed")}
-    phase = "proposed" if parts["is_proposed"] else "shadow" if found["role"] == "candidate" else "watching"
-    table |= {"schema": 1, "phase": phase, "shadow": found, "other_error": parts["error"]}
-    table |= {"comparison": parts["comparison"], "verdict": parts["verdict"]}
-    return msgspec.json.encode(table)
-
-
-def test_a_state_of_version_1_is_read_decides_as_it_did_and_goes_on_with_two_places() -> None:
-    loop, now_ns = watching(judged(NOT_JUDGED), rule=1)
-    assert loop.state.found is not None
-    loop.state.found.error.blocks = [(7, 1.5)]
-    read = decode_loop(of_version_1(loop.state))
-    assert msgspec.json.encode(read) == msgspec.json.encode(loop.state)
-    again = Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], read)
-    assert follows(again, now_ns) == ("nothing", "waits")
-    use_present_rule(read)
-    assert read.found is None and read.watched is not None and read.watched.error.blocks == [(7, 1.5)]
-    read.diagnosis = loop.state.diagnosis
-    assert follows(again, now_ns) == ("shadow", "")
-
-
-def test_a_service_goes_on_with_two_places_after_a_recording_with_one() -> None:
-    config = settings()
-    present = parse_model(extended(), source="present")
-    before = Compensation(config, parse_model(QUILL, source="before"))
-    before.begin(None)
-    state = watching(judged(NOT_JUDGED), rule=1)[0].state
-    assert state.found is not None
-    state.found.sha256 = sha256_of(QUILL)
-    opening = {"loop.json": of_version_1(state), "candidate.toml": QUILL, "candidate_state.json": before.state()}
-    core = ModelLoop(config, present, opening)
-    assert core.attachments().keys() == opening.keys()
-    core.use_present_rule()
-    moved = core.attachments()
-    assert moved.keys() == {"loop.json", "before.toml", "before_state.json"} and moved["before.toml"] == QUILL
-    assert ModelLoop(config, present, moved).state.phase == "watching"
+def test_a_state_of_another_version_is_refused() -> None:
+    table = msgspec.to_builtins(LoopState()) | {"schema": 2}
+    with pytest.raises(DataError, match="schema = 2, expected 1"):
+        decode_loop(msgspec.json.encode(table))
 
 
 def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() -> None:

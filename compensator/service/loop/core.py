@@ -15,7 +15,6 @@ from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
 from compensator.messages import Candidate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.earlier_rules import use_present_rule
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
@@ -92,13 +91,6 @@ class ModelLoop:
             shadow = self.shadows[name]
             found |= zip(SHADOW_FILES[name], (shadow.data, shadow.compensation.state()), strict=True)
         return found
-
-    def use_present_rule(self) -> None:
-        """Go on by the present rule after a recording that was decided by an earlier one."""
-        one = self.shadows.get("found")
-        use_present_rule(self.state)
-        if one is not None and self.state.watched is not None and self.state.found is None:
-            self.shadows = {"watched": one}
 
     # ------------------------------------------------------------------ one sample
 

@@ -21,7 +21,6 @@ from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
-from compensator.service.loop.earlier_rules import falls_early, has_to_wait
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import (
     ADOPTION_H,
@@ -123,7 +122,7 @@ class Loop:
         for name, place in state.taken.items():
             compared, judge = self._compared(place), False
             if suspected:
-                begins_anew = compared.add_suspected(others[name]) and state.rule > 2
+                begins_anew = compared.add_suspected(others[name])
                 if begins_anew and place.is_proposed and not state.exchange:
                     notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
             else:
@@ -150,7 +149,7 @@ class Loop:
             return self._go_back(name, place) if verdict == ComparisonVerdict.BETTER else []
         if verdict == ComparisonVerdict.WORSE:
             return self._end(name, "worse")
-        if place.is_proposed and (falls(place.verdict, self._settings) or falls_early(state, place)):
+        if place.is_proposed and falls(place.verdict, self._settings):
             return self._withdraw(place, described(place.verdict))
         if self._compared(place).is_better(now_ns) and (not place.is_proposed or self._may_adopt(place, now_ns)):
             return self._accept(place, now_ns)
@@ -246,8 +245,6 @@ class Loop:
         if running is None:
             return []
         why = why_nothing(state, self._settings, found, now_ns)
-        if not why and has_to_wait(state, self._settings, now_ns, same_effects=found.same_effects):
-            why = "waits"
         if why:
             data = LoopData(
                 step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256

@@ -48,8 +48,8 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
     if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
         return "unchanged"
-    # In two places, a model that runs in one is compared, and gone back to or adopted, from there.
-    if found.in_shadow and any(state.rule > 1 or place.role == role for place in state.taken.values()):
+    # A model that runs in shadow is compared, and gone back to or adopted, from there.
+    if found.in_shadow and state.taken:
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
@@ -74,7 +74,7 @@ def place_of_outgoing(state: LoopState, effects: Sequence[str], adopted: Sequenc
     Other parameters of the same effects end with the same effect: a model before them stays the one that is watched.
     """
     is_refined = state.watched is not None and sorted(effects) == sorted(adopted)
-    return "found" if is_refined or state.rule == 1 else "watched"
+    return "found" if is_refined else "watched"
 
 
 def falls(found: ComparisonData, settings: LoopSettings) -> bool:

@@ -55,17 +55,14 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     if last.config == loaded.data:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()
-            core.use_present_rule()
             return core
         if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
             resumed.notes.append(_complete(resumed, last))
-            core.use_present_rule()
             return core
     core.drop_ended()
     notes: list[Note] = core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
     resumed.notes += notes
     core.drop_ended()
-    core.use_present_rule()
     return ModelLoop(config, present.model, core.attachments())
 
 

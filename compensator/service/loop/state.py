@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Literal
 
 import msgspec
 
@@ -12,10 +12,8 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
-#: Version of the state; one of a later version is refused.
-STATE_SCHEMA = 3
-#: The present rule; a recording is audited by the one that it was decided by (`earlier_rules`).
-RULE: Final = 3
+#: Version of the state; another one is refused.
+STATE_SCHEMA = 1
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
@@ -102,8 +100,6 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         What a diagnosis has found: a candidate, or the calibrated model.
     watched : Place, optional
         The model before the last adoption.
-    rule : {1, 2, 3}
-        By which it is decided: in recordings before version 3 of the state an earlier one (`earlier_rules`).
     adopted_utc_ns : int
         Time of the last adoption; 0 before.
     effects : list of str
@@ -125,7 +121,6 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     clean_min: float = 0.0
     found: Place | None = None
     watched: Place | None = None
-    rule: Literal[1, 2, 3] = RULE
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
@@ -167,35 +162,17 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def decode_loop(data: bytes) -> LoopState:
-    """Read a state; one of version 1 has one place, and each goes by the rule of its time.
+    """Read a state.
 
     Raises
     ------
     DataError
-        If it is not a state of this or an earlier version.
+        If it is not a state of this version.
     """
     try:
-        read = msgspec.json.decode(data, type=dict[str, Any])
-        if read.get("schema", 1) == 1:
-            read = _with_places(read)
-        if read["schema"] == 2:
-            read |= {"schema": STATE_SCHEMA, "rule": read.pop("places")}
-        if read["schema"] != STATE_SCHEMA:
-            raise DataError(f"loop.json: schema = {read['schema']}, expected {STATE_SCHEMA}")
-        return msgspec.convert(read, LoopState)
+        found = msgspec.json.decode(data, type=LoopState)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"loop.json: {error}") from error
-
-
-def _with_places(read: dict[str, Any]) -> dict[str, Any]:
-    """Return a state of version 1 as one of version 2: its only place holds whatever is in shadow."""
-    parts = {name: read.pop(name, None) for name in ("shadow", "phase", "comparison", "verdict", "other_error")}
-    read |= {"schema": 2, "places": 1}
-    if parts["shadow"] is not None:
-        read["found"] = parts["shadow"] | {
-            "is_proposed": parts["phase"] == "proposed",
-            "comparison": parts["comparison"],
-            "verdict": parts["verdict"],
-            "error": parts["other_error"],
-        }
-    return read
+    if found.schema != STATE_SCHEMA:
+        raise DataError(f"loop.json: schema = {found.schema}, expected {STATE_SCHEMA}")
+    return found
