@@ -14,6 +14,7 @@ from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.audit.verdict import partly, verdict
+from compensator.axes import label_of
 from compensator.codes import AuditFinding, RecordingEnd
 from compensator.recording.chain import NOTHING
 from compensator.report.envelope import Envelope, line_of
@@ -319,7 +320,14 @@ def _better(found: Comparison) -> tuple[str, Tone]:
         f"With “{found.other}”, the remaining error in Y would have been {_um(after)} µm rms instead of "
         f"{_um(before)} with “{found.recorded}”, the recorded model."
     )
-    return words, "good" if after < before else "bad" if after > before else "warn"
+    tones: list[Tone] = ["good" if after < before else "bad" if after > before else "warn"]
+    for axis, one in found.axes.items():
+        after, before = one.left_after.rms, one.left_before.rms
+        words += f" {label_of(axis)}: {_um(after)} instead of {_um(before)} µm rms."
+        tones.append("warn" if after > before and tones[0] != "bad" else tones[0])
+    if found.only_y:
+        words += f" Compared on Y alone: {found.only_y}."
+    return words, tones[0] if tones.count(tones[0]) == len(tones) else "warn"
 
 
 def _before_and_after(found: Comparison) -> Table:

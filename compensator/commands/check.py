@@ -75,6 +75,8 @@ def _axes_text(axes: dict[str, Any]) -> str:
         text += f"; sign = -1 of {', '.join(turned)}: the published offset is turned, so no receiver turns it again"
     if axes["unused_parts"]:
         text += f"; the model also has {', '.join(axes['unused_parts'])}, for which there is no table [axis.*]"
+    if len(axes["axes"]) > 1:
+        text += "\nof Y alone: probes, and the checks of measured against predicted deformation"
     return text
 
 

@@ -17,7 +17,7 @@ from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.input_file import resolved
-from compensator.model.model_file import load_model
+from compensator.model.model_file import load_model, read_model_bytes
 from compensator.recording.reading import recordings_in
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) -> Answer:
-    model = load_model(name)
+    model, data = load_model(name), read_model_bytes(name)
     curves = None
     if page is not None:
         from compensator.audit.pages import Curves
@@ -73,7 +73,8 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow
             row(COLUMNS)
-        found = compare(paths, model, progress=progress, row=row, point=curves.add if curves is not None else None)
+        point = curves.add if curves is not None else None
+        found = compare(paths, model, progress=progress, row=row, point=point, data=data)
     text = found.text() + (f"\nboth offsets: {out}" if out else "")
     answer = Answer(found.as_json() | ({"out": str(out)} if out else {}), text)
     if page is None or curves is None:

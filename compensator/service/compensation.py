@@ -7,93 +7,44 @@ same estimate and the same offset again, bit for bit. The published offset never
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 
 from compensator.arrays import NAN
 from compensator.axes import FIRST
-from compensator.clock import NS
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
-from compensator.errors import DataError, ModelError, ServiceError
+from compensator.errors import ModelError
 from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.messages_axes import AxisOffset
-from compensator.model.engine import Engine, Estimate
+from compensator.model.engine import Estimate
 from compensator.model.model_file import parse_axes, parse_model
 from compensator.model.outputs import with_outputs
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.axes import FurtherOutputs, planned_outputs
-from compensator.service.axes_decision import FurtherDecision
-from compensator.service.decision import Decision, OffsetDecision, mean
+from compensator.service.axes import planned_outputs
+from compensator.service.continuity import Continuity, slowest_min
+from compensator.service.decision import Decision, mean
 from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
     HEATED_W,
-    JumpWatch,
-    PlausibilityCheck,
-    PlausibilityState,
     SensorEvidence,
-    SensorGuards,
 )
-from compensator.service.probing import Probing, ReceivedProbe, Wanted
+from compensator.service.probing import ReceivedProbe, Wanted
 from compensator.service.probing.state import PastSample
 from compensator.service.state import (
-    STATE_SCHEMA,
-    CompensationState,
-    Memory,
     ZeroMode,
-    ZeroState,
-    decode_state,
-    frozen_state,
 )
-from compensator.service.status import CompensationStatus, Handover, Zero
 
 __all__ = ["Compensation", "Outcome", "model_of", "slowest_min"]
 
 #: Number of samples over which rate and heat are averaged before they are used in a decision.
 MEAN_SAMPLES = 5
 
-#: Longest pause that is simulated, in samples: a longer one would delay the sample after it.
-MOST_BRIDGED = 1500
-#: An unknown initial state counts as known after this many slowest time constants: 5 % of its error are left.
-KNOWN_AFTER = 3.0
 
-
-class Compensation:
+class Compensation(Continuity):
     """Compensation of one machine, with the limits and guards of a configuration and a model of the deformation."""
-
-    def __init__(self, config: Config, model: ThermalModel) -> None:
-        self._config = config
-        self.model = model
-        self._period_min = model.period_s / 60.0
-        self._engine = Engine(model)
-        names = {channel.name for channel in config.channel}
-        missing = [name for name in self._engine.channels if name not in names]
-        if missing:
-            names_missing = " and ".join(map(repr, missing))
-            raise ServiceError(
-                f"model {model.name}: an effect needs channel {names_missing}, which is not configured; `compensator "
-                "check` prints the lines to paste"
-            )
-        wanted = [one.output for one in planned_outputs(config.axis)]
-        if list(model.outputs) != wanted:
-            names_of = ", ".join(one.name for one in wanted) or "Y alone"
-            raise ServiceError(f"model {model.name}: its axes are not those of the configuration, expected {names_of}")
-        self._guards = SensorGuards(config.channel, config.guards, self._period_min)
-        self.plausibility = PlausibilityCheck(config, model)
-        self._jumps = JumpWatch(config, model)
-        own_channels = dict.fromkeys(channel for effect in model.effects for channel in effect.measured)
-        self._decision = OffsetDecision(config, model, tuple(own_channels))
-        self._limiter = self._decision.limiter
-        self.outputs = FurtherOutputs(config.axis)
-        self._further = FurtherDecision(self.outputs, model, self._decision) if config.axis is not None else None
-        self._probes: tuple[ReceivedProbe, ...] = ()
-        self.probing = Probing.of(config, self._engine.contribution_names, model.period_s)
-        self._zero = ZeroState(wanted=config.zero.at_start)
-        self._memory = Memory()
-        #: Slowest time constant of the model, min.
-        self.slowest_min = slowest_min(model)
 
     # ------------------------------------------------------------------ commands
 
@@ -155,197 +106,16 @@ class Compensation:
         offset = decision.message(self.model, machine, seq, time_utc_ns, NAN)
         return (offset,) if self._further is None else self._further.hold(offset, known=known)
 
-    # ------------------------------------------------------------------ state
-
-    @property
-    def status(self) -> CompensationStatus:
-        """Zero, target and handover after the last sample."""
-        memory, zero, prediction, probing = self._memory, self._zero, self._prediction(), self.probing
-        return CompensationStatus(
-            seq=memory.seq,
-            time_utc_ns=memory.time_utc_ns,
-            zero=(
-                Zero.of_references(self._engine.reference, zero, self.outputs.states)
-                if self._engine.has_reference
-                else None
-            ),
-            is_known=memory.cold_min <= 0.0,
-            target_um=0.0 - prediction.y_um,
-            std_um=prediction.std_um,
-            handover=Handover(
-                offset_um=self._limiter.offset_um,
-                operator_hold=memory.operator_hold,
-                internal_error=memory.internal_error,
-                waiting_zero=zero.mode if zero.wanted else None,
-                model_changed=memory.model_changed,
-                probing=probing.handover if probing is not None else None,
-                further=self.outputs.offsets(),
-            ),
-        )
-
-    @property
-    def further_targets(self) -> dict[str, float]:
-        """Offsets of the further outputs by the model, before limits, by name; NaN without an estimate."""
-        found = self.outputs.predictions(self._memory.estimate)
-        return {one.name: 0.0 - predicted.value for one, predicted in zip(self.outputs.planned, found, strict=True)}
+    # ------------------------------------------------------------------ what is asked
 
     @property
     def wanted(self) -> Wanted | None:
         """Whether a probe is wanted after the last sample; None without `[probe]`."""
         return self.probing.wanted(self._prediction().std_um) if self.probing is not None else None
 
-    @property
-    def predicts_until_ns(self) -> int | None:
-        """Time of the sample that is held if the missing temperature does not return; None while none is missing."""
-        memory, predict_min = self._memory, self._config.loss.predict_for_min
-        if not 0.0 < memory.missing_min <= predict_min:
-            return None
-        samples = math.floor((predict_min - memory.missing_min) / self._period_min + 1e-9) + 1
-        return memory.time_utc_ns + round(samples * self._period_min * 60.0 * NS)
-
-    @property
-    def bridge_max_min(self) -> float:
-        """Longest pause that is interpolated, min."""
-        wanted = self._config.restart.bridge_max_min
-        return min(self.slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
-
     def describe_checks(self) -> str:
         """Describe which checks of the sensors are on and off."""
         return f"{self.plausibility.describe()}; {self._jumps.describe()}"
-
-    def state(self) -> bytes:
-        """Return everything that determines the next outcome, as JSON without loss of precision."""
-        return self.frozen()()
-
-    def frozen(self) -> Callable[[], bytes]:
-        """Return what encodes the present state, see `state`, whatever is processed until it is called."""
-        return frozen_state(
-            CompensationState(
-                schema=STATE_SCHEMA,
-                model_sha256=self.model.sha256,
-                alternative=self._config.model.alternative,
-                engine=self._engine.snapshot(),
-                guards=self._guards.snapshot(),
-                offset_um=self._limiter.offset_um,
-                zero=self._zero,
-                memory=self._memory,
-                plausibility=self.plausibility.state if self.plausibility.is_on else None,
-                probing=self.probing.state if self.probing is not None else None,
-                jumps=self._jumps.state if self._jumps.is_on else None,
-                axes=self.outputs.states if self._further is not None else None,
-            )
-        )
-
-    def restore(self, state: bytes) -> None:
-        """Continue from a state; all further outcomes are the same as without the interruption, bit for bit.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read, or belongs to another model or other channels; nothing is changed then.
-        """
-        restored = decode_state(state)
-        for name, found, expected in (
-            ("model_sha256", restored.model_sha256, self.model.sha256),
-            ("alternative", restored.alternative, self._config.model.alternative),
-            ("guards", sorted(restored.guards), sorted(self._guards.snapshot())),
-            ("axes", sorted(restored.axes or {}), sorted(self.outputs.states)),
-        ):
-            if found != expected:
-                raise DataError(f"state: {name} = {found!r}, expected {expected!r}")
-        engine = Engine(self.model)
-        try:
-            engine.check(restored.engine)
-            engine.restore(restored.engine)
-            self._jumps.restore(restored.jumps)
-        except ValueError as error:
-            raise DataError(f"state: {error}") from error
-        estimate = restored.memory.estimate
-        if estimate is not None and len(estimate.y_effects_um) != len(self.model.effects):
-            raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
-        if estimate is not None and len(estimate.outputs) != len(self.model.outputs):
-            raise DataError(f"state: estimate of {len(estimate.outputs)} further outputs")
-        if self.probing is not None and restored.probing is not None:
-            self.probing.restore(restored.probing)
-        self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
-        self._guards.restore(restored.guards)
-        self._limiter.offset_um = restored.offset_um
-        self.outputs.states = {name: (restored.axes or {})[name] for name in self.outputs.states}
-        # A state from a version without these checks does not contain theirs.
-        self.plausibility.state = restored.plausibility or PlausibilityState()
-
-    def pause(self, samples: int | None) -> None:
-        """Account for samples that were not measured, for example while the service was not running.
-
-        They count as missing: the prediction continues, its standard deviation grows, and at the next sample with both
-        temperatures they are interpolated. After more than `bridge_max_min` the state is unknown: the machine is
-        assumed to have been in its present condition throughout, and the reason `cold_start` remains until the error
-        of this assumption has decayed.
-
-        Parameters
-        ----------
-        samples : int or None
-            Number of samples; 0 has no effect. None if it is unknown, which counts as too long to be bridged.
-        """
-        if samples is None:
-            longest = max(KNOWN_AFTER * self.slowest_min, self.bridge_max_min)
-            samples = math.floor(longest / self._period_min) + 1
-        if samples <= 0:
-            return
-        minutes = samples * self._period_min
-        self._guards.pass_time(minutes)
-        self.plausibility.pass_time(samples)
-        self._memory.missing_min += minutes
-        if not self._engine.has_reference:
-            return
-        is_cold = minutes > self.bridge_max_min
-        self._jumps.pass_time(min(samples, MOST_BRIDGED), held=is_cold)
-        if is_cold:
-            self._pass_cold(min(samples, MOST_BRIDGED))
-        else:
-            self._memory.estimate = self._engine.skip(samples)
-        if self.probing is not None and self._memory.estimate is not None:
-            self.probing.pass_time(self._memory.estimate.contributions_um, minutes)
-
-    @property
-    def _cold_samples(self) -> int:
-        """Samples after which a state that started unknown counts as known."""
-        return min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED)
-
-    def _pass_cold(self, samples: int) -> None:
-        self._memory.estimate = self._engine.skip(samples, held=True)
-        self._memory.cold_min = KNOWN_AFTER * self.slowest_min
-
-    def begin(self, zero: Zero | None) -> None:
-        """Start with a zero that was set before the record, and with an unknown state.
-
-        Parameters
-        ----------
-        zero : Zero or None
-            None to wait for the zero of the record, regardless of `zero.at_start`.
-        """
-        self.outputs.begin({} if zero is None else zero.further)
-        if zero is None:
-            self._zero = ZeroState()
-            return
-        self._engine.set_reference(zero.t_q_ref_degc, zero.at_ref_degc)
-        self._zero = ZeroState(y_ref=zero.y_ref_um, y_base=zero.y_base_um)
-        self._pass_cold(self._cold_samples)
-
-    def continue_from(self, handover: Handover) -> None:
-        """Continue from another compensation: its offset moves on at the permitted rate, and its holds remain."""
-        self._limiter.offset_um = handover.offset_um
-        memory, zero = self._memory, self._zero
-        memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
-        memory.model_changed = handover.model_changed
-        self.outputs.continue_from(handover.further, model_changed=handover.model_changed)
-        zero.wanted, zero.mode = handover.waiting_zero is not None, handover.waiting_zero or zero.mode
-        if self.probing is not None and handover.probing is not None:
-            self.probing.continue_from(handover.probing)
-
-    def raise_level(self, um: float) -> None:
-        """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""
-        self._zero.y_base -= um
 
     # ------------------------------------------------------------------ one sample
 
@@ -424,19 +194,6 @@ class Compensation:
         for name, value in found.accepted.items():
             self._guards.accept(name, value)
         return found.estimate
-
-    def _prediction(self) -> Prediction:
-        """Return the deformation since the zero after the last sample, corrected by the probes; NaN before a zero."""
-        estimate = self._memory.estimate
-        if estimate is None:
-            return Prediction()
-        y_um, std_um, rate = estimate.y_um - self._zero.y_base, estimate.y_std_um, estimate.y_rate_um_per_min
-        if self.probing is None:
-            return Prediction(y_um, std_um, rate)
-        found = self.probing.corrected(estimate.contributions_um, self._engine.y_noise_std_um)
-        if math.isnan(found.std_um):
-            return Prediction(y_um, std_um, rate)
-        return Prediction(y_um + found.y_um, found.std_um, rate + found.rate_um_per_min, found.is_limited)
 
     def _remember_sample(self, time_ns: int, estimate: Estimate) -> None:
         """Keep what a probe of this time is compared with."""
@@ -548,14 +305,3 @@ def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:
         return with_outputs(models, first, [one.output for one in planned_outputs(config.axis)])
     except ModelError as error:
         raise ModelError(f"{source}: {error}") from error
-
-
-def slowest_min(model: ThermalModel) -> float:
-    """Return the slowest time constant of the paths and effects of a model and its further parts, min."""
-    times: list[float] = []
-    for part in (model, *model.parts):
-        paths = [path for path in (part.ttf, part.dtf, part.tdtf) if path is not None]
-        times += [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
-        for effect in part.effects:
-            times += effect.time_constants_min
-    return max(times, default=model.period_s / 60.0)

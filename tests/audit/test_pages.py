@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import Comparison
+from compensator.audit.comparison import AxisComparison, Comparison
 from compensator.audit.pages import Curves, comparison_page
 from compensator.cli import main
 from compensator.recording.reading import recordings
@@ -112,7 +112,7 @@ def test_the_tone_says_which_is_better(after: float, tone: str) -> None:
     if not math.isnan(after):
         before.add(2.0, 1)
         then.add(after, 1)
-    found = Comparison("a", "b", before, then, before, then, Spread(), 1, [])
+    found = Comparison("a", "b", AxisComparison(before, then, before, then, Spread()), 1, [])
     curves = Curves()
     curves.add(60 * 10**9, math.nan, 1.0, math.nan, 2.0)
     made = comparison_page(found, curves)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import pytest
 
 from compensator.audit.comparison import compare
 from compensator.audit.series import audit
+from compensator.cli import main
 from compensator.config import LoadedConfig, parse_config
 from compensator.errors import CompensatorError, ConfigError, ModelError, ServiceError
 from compensator.messages import Offset, encode, schemas, shipped_schema
 from compensator.messages_axes import AXES_MESSAGES, AxesEstimate, further_values
 from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
+from compensator.model.thermal_model import Path as ModelPath
 from compensator.recording.live_file import RecordingFile
 from compensator.recording.reading import messages
 from compensator.service.compensation import Compensation, Outcome, model_of
@@ -457,6 +460,41 @@ def test_another_model_is_compared_on_y(day: SeveralAxes) -> None:
     found = compare(day.recordings[:1], load_model("quill"))
     assert found.samples == 300
     assert found.residual_after.rms == pytest.approx(found.residual_before.rms, abs=1e-6)
+
+
+def test_another_model_is_compared_on_every_axis_that_is_measured(
+    day: SeveralAxes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    z = part("z")
+    gains = tuple(1.5 * gain for gain in z.dtf.continuous.numerator)  # type: ignore[union-attr]
+    stronger = ModelPath.from_continuous(
+        dataclasses.replace(z.dtf.continuous, numerator=gains),  # type: ignore[type-var]
+        z.period_s,
+    )
+    other = model_text(*PARTS, parts={"z": dataclasses.replace(z, dtf=stronger)})
+    (tmp_path / "other.toml").write_bytes(other)
+    (tmp_path / "y.toml").write_bytes(model_text("y"))
+
+    def compared(name: str) -> dict[str, Any]:
+        assert main(["replay", str(day.recordings[0]), "--model", str(tmp_path / name), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)  # type: ignore[no-any-return]
+
+    found = compared("other.toml")
+    assert set(found["axes"]) == {"x", "z"}  # no tilt and no slope is measured
+    for one in (found, found["axes"]["x"]):
+        assert one["left_um"]["after"] == one["left_um"]["before"] and one["offset_difference_um"]["peak_um"] == 0.0
+    z_left = found["axes"]["z"]["left_um"]
+    assert z_left["after"]["samples"] == z_left["before"]["samples"] > 250
+    assert z_left["after"]["rms_um"] > 3.0 * z_left["before"]["rms_um"]
+    page = tmp_path / "page.html"
+    command = ["replay", str(day.recordings[0]), "--model", str(tmp_path / "other.toml"), "--page", str(page)]
+    assert main(command) == 0
+    assert "Z: remaining error, quill (recorded)" in capsys.readouterr().out
+    assert re.search(r" Z: [0-9.]+ instead of [0-9.]+ µm rms\.", page.read_text(encoding="utf-8"))
+    # A model of Y alone is compared on Y, and that is said.
+    alone = compared("y.toml")
+    assert "axes" not in alone and "no part axis.x in the model" in alone["only_y"]
+    assert alone["left_um"] == found["left_um"]
 
 
 def test_a_model_without_the_axes_of_the_configuration_is_refused() -> None:

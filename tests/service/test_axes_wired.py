@@ -66,7 +66,7 @@ def test_the_check_names_the_axes_and_what_the_model_has_beyond(
 ) -> None:
     path, _ = machine
     assert main(["check", "--config", str(path)]) == 0
-    assert "axes: x, y, z, a\n" in capsys.readouterr().out
+    assert "axes: x, y, z, a\nof Y alone: probes, and the checks of measured" in capsys.readouterr().out
     plain = path.read_text(encoding="utf-8")
     path.write_text(plain.replace("[axis.z]", "[axis.z]\nsign = -1"), encoding="utf-8")
     assert main(["check", "--config", str(path)]) == 0
@@ -90,9 +90,9 @@ def test_the_check_of_y_alone_names_what_the_model_has_beyond(
     text = path.read_text(encoding="utf-8").replace(AXES + TILT + SLOPE, "")
     path.write_text(text.replace("[limits]\n", f"[limits]\n{LIMITS}"), encoding="utf-8")
     assert main(["check", "--config", str(path)]) == 0
-    assert (
-        "axes: y; the model also has x, z, low, high, y_slope, for which there is no table" in capsys.readouterr().out
-    )
+    said = capsys.readouterr().out
+    assert "axes: y; the model also has x, z, low, high, y_slope, for which there is no table" in said
+    assert "of Y alone" not in said
 
 
 def test_each_axis_has_its_key_and_answers_with_its_latest() -> None:
