@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import msgspec
 import pytest
 from msgspec.structs import replace
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
@@ -29,7 +27,7 @@ from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
-from compensator.service.loop.state import LoopState, Place, Running, decode_loop
+from compensator.service.loop.state import LoopState, Place, Running
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import model_store
@@ -181,12 +179,6 @@ def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData,
     assert {name: place.sha256[0] for name, place in loop.state.taken.items()} == {"watched": "a", "found": "b"}
     assert loop.state.watched is not None and loop.state.watched.verdict == verdict
     assert loop.state.phase == "shadow"
-
-
-def test_a_state_of_another_version_is_refused() -> None:
-    table = msgspec.to_builtins(LoopState()) | {"schema": 2}
-    with pytest.raises(DataError, match="schema = 2, expected 1"):
-        decode_loop(msgspec.json.encode(table))
 
 
 def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() -> None:
