@@ -285,7 +285,8 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
 
     machine.diagnose = hanging  # type: ignore[method-assign]
     await machine.run(410)
-    for _ in range(3):
+    await machine.run(200, until=lambda _: len(machine.asked) == 2)
+    for _ in range(2):
         await machine.run(10)
     assert len(machine.asked) == 2
     assert machine.steps() == [("diagnose", "planned"), ("diagnose", "again"), ("end", "interrupted")]
