@@ -141,7 +141,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; by default those of `sys.argv`.
     """
-    stoppable()
+    try:
+        stoppable()
+    except KeyboardInterrupt:  # it waited
+        return 130
     one_thread_from_start()
     given, unknown = _parser().parse_known_args(argv)
     if unknown:

@@ -9,6 +9,7 @@ was moved.
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import replace
 
 import msgspec
@@ -24,6 +25,7 @@ from compensator.recording.signature import Verifier
 
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
+_TIME = re.compile(rb'"time_utc_ns":(\d{1,19}),')
 _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
 
 
@@ -108,7 +110,7 @@ class ChainCheck:
                 self._seal(before, RawRecord(topic, its_number, its_time, its_body))
             else:
                 result.seal, result.sealed_signed = "", False
-                self._add_unsigned(topic, its_time)
+                self._add_unsigned(topic, its_time, its_body)
         result.records += len(records)
         self._compare_head(value)
         expected = (
@@ -127,7 +129,7 @@ class ChainCheck:
         for record in records:
             self.head = chain.link(self.head, record.topic, record.body)
             result.seal, result.sealed_signed = "", False
-            self._add_unsigned(record.topic, record.log_time_ns)
+            self._add_unsigned(record.topic, record.log_time_ns, record.body)
             self._compare_head(self.head)
         result.records += len(records)
 
@@ -324,22 +326,28 @@ class ChainCheck:
             result.find(Fault.SEAL_CHANGED, record)
         if not seal.signature:
             result.sealed_signed = False
-            self._add_unsigned(record.topic, record.log_time_ns)
+            self._add_unsigned(record.topic, record.log_time_ns, record.body)
             return
         result.signed += 1
         result.keys.add(seal.public_key)
         result.sealed_signed = True
         if self._verifier is not None and not self._verifier.holds(seal):
             result.find(Fault.FALSE_SIGNATURE, record)
-            self._add_unsigned(record.topic, record.log_time_ns)
+            self._add_unsigned(record.topic, record.log_time_ns, record.body)
         elif (seal.sha256, seal.sequence) == (before.hex(), record.sequence - 1):
             self._covered(record.log_time_ns)
 
-    def _add_unsigned(self, topic: str, time_ns: int) -> None:
-        """Count a record that no signature covers yet."""
+    def _add_unsigned(self, topic: str, time_ns: int, body: bytes) -> None:
+        """Count a record that no signature covers yet.
+
+        A sample counts by its own time, too, which is that of its group: without a signature either can be rewritten.
+        """
         result = self._result
         result.unsigned_behind += 1
         result.unsigned_samples += topic == "sample"
+        own = _TIME.search(body) if topic == "sample" else None
+        if own is not None:
+            time_ns = max(time_ns, int(own[1]), key=lambda ns: abs(ns - self._signed_ns))
         age_ns, self._last_ns = abs(time_ns - self._signed_ns), time_ns
         result.unsigned_min = abs(time_ns - self._covered_ns) / 60e9
         # The recorder writes a seal in the same group of bytes as the first records for which one is due.

@@ -19,10 +19,10 @@ def stoppable() -> None:
     """
     if threading.current_thread() is not threading.main_thread():
         return
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, usual)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)  # last: one that waits would be lost were it still ignored
 
 
 def on_stop(stop: Callable[[], object]) -> None:

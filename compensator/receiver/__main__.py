@@ -25,9 +25,10 @@ def main() -> int:
     # No threading.Event: a handler that sets it while this thread waits for it could wait for its lock for ever.
     ended: list[int] = []
     signals = (signal.SIGINT, signal.SIGTERM)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # who starts a program may have blocked them
     for number in signals:
         signal.signal(number, lambda number, _: ended.append(number))
+    # Who starts a program may have blocked them; one that waits would be lost were it still ignored.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
     try:
         settings, _ = load_any(arguments.config)
         receiver = AxesReceiver(settings) if isinstance(settings, AxesSettings) else Receiver(settings)

@@ -6,7 +6,7 @@ import bisect
 import math
 from pathlib import Path
 
-from .settings import read_file
+from .settings import read_file, write_file
 from .values import finite
 
 #: A value is written when it has changed by this, µm, and at least this often, s.
@@ -52,8 +52,7 @@ class AppliedRecord:
             return
         if self._path.exists() and self._path.stat().st_size > LONGEST:
             self._path.replace(self._path.with_name(self._path.name + ".1"))
-        with self._path.open("a", encoding="ascii") as file:
-            file.write(f"{time_utc_ns} {'-' if offset_um is None else f'{offset_um:.3f}'}\n")
+        write_file(self._path, f"{time_utc_ns} {'-' if offset_um is None else f'{offset_um:.3f}'}\n", append=True)
         self._last = (time_utc_ns, offset_um)
 
     def _is_due(self, time_utc_ns: int, offset_um: float | None) -> bool:

@@ -8,7 +8,6 @@ not answer would block the caller's loop.
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -24,7 +23,7 @@ from .errors import ReceiverError
 from .message import PAYLOAD_MAX_BYTES, SEQ_MAX, ProbeWanted, Rejected, parse_status
 from .modes import Modes
 from .reasons import Reason
-from .settings import STATE_MAX_BYTES, ZENOH_BRACKETS, ZENOH_MAX_BYTES, Source, read_file
+from .settings import STATE_MAX_BYTES, ZENOH_BRACKETS, ZENOH_MAX_BYTES, Source, read_file, write_file
 
 #: One attempt to reach the router, ms, and the pause before the next, s.
 CONNECT_TIMEOUT_MS = 1000
@@ -302,10 +301,7 @@ class Client(ABC):
             return
         part = self._state_file.with_name(self._state_file.name + ".part")
         try:
-            with part.open("w", encoding="utf-8") as file:
-                json.dump(self._modes.snapshot(), file)
-                file.flush()
-                os.fsync(file.fileno())
+            write_file(part, json.dumps(self._modes.snapshot()))
             part.replace(self._state_file)
         except OSError as error:
             self._remark = Reason("state_not_saved", f"{self._state_file}: {error.strerror or error}")

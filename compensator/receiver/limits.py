@@ -177,4 +177,4 @@ class ToolLimits:
         if self.rate_at_tool_change_um_per_min != 0.0:
             check_limits(self, ("rate_at_tool_change_um_per_min",))
         if self.length_from not in ("control", "zenoh"):
-            raise ReceiverError(f"length_from = {self.length_from!r}: expected 'control' or 'zenoh'")
+            raise ReceiverError(f"length_from = {self.length_from[:60]!r}: expected 'control' or 'zenoh'")

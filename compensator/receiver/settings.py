@@ -180,6 +180,34 @@ def read_file(path: Path, most: int) -> bytes:
     return data
 
 
+def write_file(path: Path, text: str, *, append: bool = False) -> None:
+    """Write a regular file, made where there is none.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    text : str
+        Its new content, or what is added to it.
+    append : bool
+        Whether to add; otherwise the content is replaced and synced to disk.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written, or is a device, a pipe or a folder.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe would wait for its reader
+    descriptor = os.open(path, flags | (os.O_APPEND if append else os.O_TRUNC), 0o666)
+    with open(descriptor, "w", encoding="utf-8") as file:  # noqa: PTH123  a descriptor
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file")
+        file.write(text)
+        if not append:
+            file.flush()
+            os.fsync(descriptor)
+
+
 def _absolute(path: Path) -> str:
     """Return an absolute path; one that leads nowhere is reported where it is opened."""
     try:

@@ -20,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 
 from compensator.atomic_write import sync_folder
 from compensator.errors import DataError
+from compensator.input_file import open_file
 from compensator.recording import chain
 from compensator.recording.container import (
     PAYLOAD,
@@ -114,7 +115,7 @@ def rewrite(
     """
     part = path.with_name(path.name.removesuffix(".mcap") + _PART)
     part.unlink(missing_ok=True)
-    with path.open("rb") as live:
+    with open_file(path) as live:  # a pipe with such a name would never have an end
         try:
             fcntl.flock(live, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -73,7 +73,7 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
 def is_used(folder: Path, machine: str) -> bool:
     """Return whether a service of a machine has locked its recording folder; nothing is changed."""
     try:
-        descriptor = os.open(folder / f"{machine}.lock", os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = os.open(folder / f"{machine}.lock", os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:
         return False
     try:
@@ -92,7 +92,7 @@ def _opened(path: Path) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError:
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # the disk may have become read-only
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # the disk may have become read-only
 
 
 @contextmanager

@@ -44,9 +44,9 @@ def main() -> int:
     arguments = parser.parse_args()
     ended: list[int] = []
     signals = (signal.SIGTERM, signal.SIGINT)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # whoever starts it may have blocked them
     for number in signals:
         signal.signal(number, lambda *_: ended.append(1))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # whoever starts it may have blocked them
     try:
         settings, tables = load_any(arguments.config)
         make: Callable[[Any], Machine]

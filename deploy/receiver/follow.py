@@ -13,10 +13,10 @@ def apply(offset_um: float, why: str) -> None:
 
 
 ending = (signal.SIGINT, signal.SIGTERM)
-signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)  # whoever starts it may have blocked or ignored them
 for number in ending:
     signal.signal(number, signal.default_int_handler)
 try:
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)  # whoever starts it may have blocked or ignored them
     settings, _ = load_settings(sys.argv[1] if len(sys.argv) > 1 else "receiver.toml")
     with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: the offset at your control now
         while True:

@@ -18,6 +18,7 @@ from compensator.messages import Seal, encode
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer, Verifier
 from compensator.service.loading import load_signer
+from tests.audit.attacks import rechained, without_seals
 from tests.audit.made import CONFIG, MACHINE, Service
 from tests.audit.tampering import Line, find, lines_of, rewrite, with_new_values
 
@@ -105,6 +106,25 @@ def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path
 
 
 # ------------------------------------------------------------------ keys
+
+
+@pytest.mark.parametrize("part", [60, 10**12])
+def test_times_of_records_that_were_pushed_together_do_not_make_a_stripped_file_young(
+    tmp_path: Path, part: int
+) -> None:
+    private, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec", signer=Signer(private)).run(100).kill()
+    (path,) = recordings(tmp_path / "rec", MACHINE)
+    assert audit([path], public_key=public).clean
+
+    def pushed(lines: list[Line]) -> list[Line]:
+        first = lines[0].time_ns
+        return [replace(line, time_ns=first + (line.time_ns - first) // part) for line in without_seals(lines)]
+
+    rechained(path, pushed)
+    found = audit([path], public_key=public)
+    (finding,) = found.findings
+    assert "unsigned: no valid signature covers" in finding.line() and "100 sample(s)" in finding.line()
 
 
 def test_a_key_among_the_recordings_is_refused(tmp_path: Path) -> None:

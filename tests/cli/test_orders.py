@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -52,3 +54,14 @@ def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> No
     assert not is_used(tmp_path, "vmc-07")
     with sole_user(tmp_path, "vmc-07"):  # looking did not keep it
         pass
+
+
+def test_a_pipe_in_the_place_of_the_lock_is_asked_without_waiting_for_its_writer(tmp_path: Path) -> None:
+    os.mkfifo(lock := tmp_path / "vmc-07.lock")
+    asks = threading.Thread(target=lambda: is_used(tmp_path, "vmc-07"), daemon=True)
+    asks.start()
+    asks.join(5.0)
+    try:
+        assert not asks.is_alive()
+    finally:
+        os.close(os.open(lock, os.O_RDWR))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.receiver.wire import free_port
+from tests.receiver.wire import free_port, router, until
 
 ROOT = Path(__file__).parents[2]
 #: Starts a program as a script's background does, and worse.
@@ -94,6 +94,41 @@ def test_ends_when_started_with_the_signals_ignored_and_blocked(
         process.kill()
         process.communicate()
     assert process.returncode == 0 and "Traceback" not in shown, shown
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", ["receiver", "follow.py", "router", "watch"])
+def test_a_signal_that_waited_for_the_program_to_start_ends_it(
+    tmp_path: Path, name: str, number: signal.Signals
+) -> None:
+    """Sent while both are ignored and blocked, it is kept; unblocked while still ignored it would be lost."""
+    words, text = PROGRAMS[name]
+    port = free_port()
+    (tmp_path / "file.json5").write_text(text.replace("{port}", str(port)))
+    script = IGNORING.replace("os.execv", f"os.kill(os.getpid(), {number.value})\nos.execv")
+    command = [sys.executable, "-c", script, *(word.replace("{port}", str(port)) for word in words)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50, check=False)
+    assert done.returncode in (0, 130, -signal.SIGTERM) and "Traceback" not in done.stderr, done.stderr
+
+
+def test_sigterm_ends_the_example_that_was_started_with_it_ignored() -> None:
+    port = free_port()
+    ignored = IGNORING.replace("signal.pthread_sigmask", "# signal.pthread_sigmask")
+    words = [str(ROOT / "deploy/examples/subscriber.py"), f"tcp/127.0.0.1:{port}"]
+    with router(port), subprocess.Popen([sys.executable, "-c", ignored, *words]) as process:
+        try:
+            status = Path(f"/proc/{process.pid}/status")
+            until(lambda: is_kept(status, signal.SIGTERM), "SIGTERM is no longer ignored")
+            process.terminate()
+            assert process.wait(timeout=20) == -signal.SIGTERM
+        finally:
+            process.kill()
+
+
+def is_kept(status: Path, number: int) -> bool:
+    """Whether a process does not ignore a signal."""
+    (ignored,) = (line.split()[1] for line in status.read_text().splitlines() if line.startswith("SigIgn"))
+    return not int(ignored, 16) >> (number - 1) & 1 and "python" in status.read_text()
 
 
 #: Waits while another process sends signals one after another: a handler that needs a lock meets itself.

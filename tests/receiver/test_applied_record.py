@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 
 import pytest
 
 from compensator.receiver import applied_record
 from compensator.receiver.applied_record import EVERY_S, GAP_S, AppliedRecord, applied_at
+from compensator.receiver.settings import write_file
 
 S = 1_000_000_000
 
@@ -80,3 +83,28 @@ def test_a_clock_set_back(tmp_path: Path) -> None:
     path = tmp_path / "applied.txt"
     recorded(path, [(100, 1.0), (102, 1.0), (50, 7.0), (52, 7.0)])
     assert at(path, 51) == 7.0
+
+
+def test_a_pipe_in_the_place_of_the_file_never_blocks_the_loop_of_the_control(tmp_path: Path) -> None:
+    os.mkfifo(path := tmp_path / "applied.txt")
+    caller = threading.Thread(target=lambda: refused.append(tries(path)), daemon=True)
+    refused: list[bool] = []
+    caller.start()
+    caller.join(5.0)
+    try:
+        assert refused == [True]
+        os.mkfifo(part := tmp_path / "state.json.part")
+        with pytest.raises(OSError):
+            write_file(part, "{}")
+        with pytest.raises(OSError, match="not a regular file"):
+            write_file(Path("/dev/null"), "{}")
+    finally:
+        os.close(os.open(path, os.O_RDWR))  # where it waits for a reader, it has one now
+
+
+def tries(path: Path) -> bool:
+    try:
+        AppliedRecord(path).append(S, 1.0)
+    except OSError:
+        return True
+    return False

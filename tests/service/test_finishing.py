@@ -143,6 +143,22 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     assert audit([path]).samples == 10
 
 
+def test_a_pipe_with_the_name_of_a_recording_is_refused_and_the_service_ends(tmp_path: Path) -> None:
+    service = Service(tmp_path).run(3)
+    os.mkfifo(pipe := tmp_path / f"{MACHINE}_20250101T000000Z.mcap")
+    finisher = Finisher(tmp_path, MACHINE, Retention(), None)
+    finisher.enqueue(pipe, service.now_ns)
+    waits = threading.Thread(target=finisher.wait, daemon=True)
+    waits.start()
+    waits.join(5.0)
+    try:
+        assert not waits.is_alive()
+        assert any("not a regular file" in text for text, _ in finisher.remarks())
+    finally:
+        os.close(os.open(pipe, os.O_RDWR))  # where it waits for a writer, it has one now
+        service.stop()
+
+
 def test_older_and_damaged_files_are_left_alone(tmp_path: Path) -> None:
     path = live(tmp_path)
     data = bytearray(path.read_bytes())

@@ -101,6 +101,24 @@ def test_a_jump_is_never_ok_and_its_mend_makes_the_offset_right_at_once(
     assert np.max(np.abs(np.diff(offsets(outcomes)))) <= 20.0 + 1e-9
 
 
+@pytest.mark.parametrize("size", [5.0, -5.0])
+@pytest.mark.parametrize("end", [BEGIN + 30, END])
+def test_air_that_jumps_in_three_samples_is_right_again_at_once_after_its_mend(
+    day: dict[str, np.ndarray], size: float, end: int
+) -> None:
+    """Suspect from its first step on; the further ones are no loose contact, and what returns is all of them."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if BEGIN <= i < end:
+            values["at_degc"] += size * min((i - BEGIN + 1) / 3.0, 1.0)
+
+    outcomes = run(day, change)
+    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    assert all("suspect_channel:at_degc" in o.offset.reasons for o in outcomes[BEGIN + 1 : end])
+    assert events(outcomes, "accepted") == [end + 2]
+    assert not np.any(wrong[end + 12 :]) and outcomes[-1].offset.state == "ok"
+
+
 @pytest.mark.parametrize("size", [8.0, -8.0])
 def test_a_jump_that_takes_three_samples_is_one_jump(day: dict[str, np.ndarray], size: float) -> None:
     """Each step is within the permitted rate; less the first step alone, the rest would be heat."""

@@ -18,6 +18,8 @@ NEAR = 4.0
 _RETURNED, _RETURNED_MOST = 0.2, 0.5
 #: Consecutive samples for which a channel must be back; doubled by each further jump, up to the last number.
 BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
+#: Further samples that one jump may take: a contact that gives way in 3 min is none that comes and goes.
+_MOST_STEPS = 2
 #: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
 _UNSTEADY = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
@@ -119,7 +121,7 @@ class JumpEngines:
         values: dict[str, float] = {}
         new: list[str] = []
         for name in TEMPERATURES:
-            value = offered[name]
+            value, goes_on = offered[name], False
             expected, std = expected_value(self.shifted.engine, name, values.get("at_degc", NAN))
             difference = value - expected
             if math.isnan(value):
@@ -141,16 +143,20 @@ class JumpEngines:
                     values[name] = value - shift
                 else:
                     new.append(name)
-                    state.again += 1
+                    same_way = (difference - shift) * shift > 0.0
+                    goes_on = same_way and state.samples <= 1 and state.steps < _MOST_STEPS
+                    state.steps += goes_on
+                    state.again += not goes_on
             elif name in jumped:
                 new.append(name)
             else:
                 values[name] = value
             if name in new:
                 state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
-                # What goes on to move while it is only watched is one jump; a suspect channel has jumped again.
+                # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect
+                # channel that had come to rest has jumped again.
                 first_k = state.first_k.get(name, difference)
-                state.first_k[name] = first_k if state.is_suspect else difference
+                state.first_k[name] = first_k if state.is_suspect and not goes_on else difference
         return Fed(values, new)
 
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:

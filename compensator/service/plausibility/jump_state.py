@@ -29,6 +29,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         By channel that has jumped: measured − expected, K. Empty if none has.
     first_k : dict of str to float
         The first jump of each of them, K.
+    steps : int
+        Further samples that these jumps have taken.
     again : int
         Jumps after the first one, also of earlier times until `FORGOTTEN_SAMPLES` have passed.
     quiet : int
@@ -58,6 +60,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     level_um: float = NAN
     shifts_k: dict[str, float] = {}
     first_k: dict[str, float] = {}
+    steps: int = 0
     again: int = 0
     quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
