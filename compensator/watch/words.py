@@ -146,7 +146,7 @@ def loop_text(loop: Mapping[str, Any]) -> str:
     words = {
         "idle": "Model: nothing better is known.",
         "shadow": f"Model: a candidate with {effects} runs beside the present one. {why}.",
-        "proposed": f"Model: a better one is proposed, with {effects}. {why}.",
+        "proposed": f"Model: one that has shown itself better is proposed, with {effects}. Now: {loop['text']}.",
         "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {why}.",
     }
     text = words[loop["phase"]]

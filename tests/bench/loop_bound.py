@@ -38,6 +38,8 @@ class Bound:
         Error of the calibrated model by minute where no effect acts, µm; NaN where the service does not run.
     error : numpy.ndarray, shape (n,)
         Error with each true effect from when it is shown, µm.
+    parts : list of numpy.ndarray, shape (n,)
+        What each effect adds to the error of the calibrated model, µm.
     shown_h : list of (float or None)
         How long after its beginning each effect is shown, h; None if it never is.
     """
@@ -45,13 +47,14 @@ class Bound:
     def __init__(self, week, config, base):
         healthy = run_alone(config, base, samples_of(week, week.healthy, week.healthy_um))
         self.best = error_of(healthy, week.healthy_um)
-        self.error, self.shown_h = self.best.copy(), []
+        self.error, self.parts, self.shown_h = self.best.copy(), [], []
         for spell, (columns, true_um) in zip(week.spells, week.alone, strict=True):
             acted = run_alone(config, base, samples_of(week, columns, true_um))
             shown = shown_at(acted, healthy, spell, config)
             self.shown_h.append((shown - spell.from_min) / 60.0 if shown is not None else None)
             unknown = np.arange(week.minutes) < (shown if shown is not None else week.minutes)
-            self.error += np.where(unknown, error_of(acted, true_um) - self.best, 0.0)
+            self.parts.append(error_of(acted, true_um) - self.best)
+            self.error += np.where(unknown, self.parts[-1], 0.0)
 
 
 def shown_at(acted, healthy, spell, config):

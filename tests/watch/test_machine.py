@@ -335,7 +335,7 @@ def test_a_proposed_model_is_shown_with_its_figures_and_what_a_person_can_answer
     assert "loop" not in heard.machine  # a machine without a loop
     heard.hear(status=status(6, START_NS + 60 * NS, loop=LOOP))
     found = heard.machine["loop"]
-    assert "a better one is proposed, with input:coolant_degc" in found["line"]
+    assert "one that has shown itself better is proposed, with input:coolant_degc" in found["line"]
     assert "present 6.9 µm rms, this one 1.2" in found["line"]
     assert [command.split()[1] for command in found["commands"]] == ["adopt", "dismiss"]
     assert "goes on" not in found["line"]

@@ -175,7 +175,7 @@ def test_a_proposal_is_a_line_with_two_commands() -> None:
     assert "Model:" not in shown(shop, 200)
     shop.receive("shop/vmc-01/thermal/status", status(3, clock.now_ns, loop=LOOP))
     text = " ".join(shown(shop, 200).replace("│", "").split())
-    assert "a better one is proposed" in text and "compensator adopt --candidate" in text
+    assert "one that has shown itself better is proposed" in text and "compensator adopt --candidate" in text
     assert "compensator dismiss" in text
     one = shop.one("shop/vmc-01")
     assert one is not None and "better model proposed" in line(one)
