@@ -196,6 +196,10 @@ def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
             names.append(table["name"])
             if kind == "machine" and not PREFIX.fullmatch(table["prefix"]):
                 refuse(f"machine {table['name']!r}: prefix {table['prefix']!r}, expected words between single slashes")
+            if table.get("machines") == []:
+                refuse(
+                    f"{kind} {table['name']!r}: machines = [], expected at least one, or no such line for all of them"
+                )
             for machine in table.get("machines", []):
                 if machine not in [known["name"] for known in shop["machine"]]:
                     refuse(f"{kind} {table['name']!r}: machine {machine!r}: no such [[machine]]")

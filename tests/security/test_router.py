@@ -122,6 +122,7 @@ def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
         ("[[operator]]", "[[operater]]", "operater"),
         ('name = "anna"', "name = 5", "name = 5, expected a text"),
         ('machines = ["vmc-07"]', "machines = [7]", "expected texts"),
+        ('machines = ["vmc-07"]', "machines = []", "expected at least one"),
         ("[[operator]]", "[operator]", "expected tables [[operator]]"),
         ("[[operator]]", ".".join("a" * 400) + " = 1\n[[operator]]", "more than 300 points"),
     ],
