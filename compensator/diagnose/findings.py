@@ -140,10 +140,14 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
 
 
 def _has_own_error(fit: Fit) -> bool:
-    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact."""
-    points = fit.likelihood.points
+    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact.
+
+    What the engine leaves of a dead time of T_Q is what it could not foretell, and no error of the paths.
+    """
+    points, late = fit.likelihood.points, late_term(fit)
     deployable = any(term.effect.deployable for term in fit.terms)
-    return deployable and not points.is_exact and not points.evidence.is_sparse
+    foretold = late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
+    return deployable and not foretold and not points.is_exact and not points.evidence.is_sparse
 
 
 def _remainder(
@@ -167,8 +171,9 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    # Where nothing is known of the paths, the names carry the whole deformation into states that were not seen.
-    charge = search.criterion.charge(fit) + WORTH * evidence.free_paths
+    # A name costs something, its deployment does not. But where nothing is known of the paths, names carry the whole
+    # deformation into states that were not seen.
+    charge = search.criterion.charge(fit) + WORTH if evidence.free_paths else 0.0
     if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - charge:
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))
