@@ -268,7 +268,8 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     """
     if found.refitted or not effects:
         return [effect.effect for effect in effects]
-    rows = dict(zip(map(id, found.terms), std_factors(found.fit, found.terms), strict=True))
+    factors = std_factors(found.fit, found.terms, beside_own_error=found.belongs)
+    rows = dict(zip(map(id, found.terms), factors, strict=True))
     # Rows belong together by their place: those of effects that the model has already come first.
     before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
     return [
