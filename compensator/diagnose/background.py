@@ -192,15 +192,10 @@ class _Problem:
         gains = (np.linalg.solve(gram, white.T @ target)[self._fixed :]) * weights
         sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
-        # The directions of the covariance that matter most for y, over what was seen.
         seen = self.table * np.where(np.isfinite(self.scale), self.scale, 0.0)
-        _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)
-        factor = (root @ directions[:MOST_ROWS].T).T
         template, lags = self.background.template, len(self.background.template.taus_min)
         effect = dataclasses.replace(
-            template,
-            gains=tuple(map(tuple, gains.reshape(-1, lags).tolist())),
-            std_factor=tuple(map(tuple, factor.tolist())),
+            template, gains=tuple(map(tuple, gains.reshape(-1, lags).tolist())), std_factor=strongest(root, seen)
         )
         return Regressed(
             effect=effect,
@@ -208,3 +203,17 @@ class _Problem:
             log_evidence=log_evidence,
             rest=self._rest(x),
         )
+
+
+def strongest(root: Matrix, seen: Matrix) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of `Regression.std_factor`: the directions of a covariance that matter most for y.
+
+    Parameters
+    ----------
+    root : numpy.ndarray, shape (gains, k)
+        A root of the covariance of the gains.
+    seen : numpy.ndarray, shape (points, gains)
+        What each gain moves, over what was seen.
+    """
+    _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)
+    return tuple(map(tuple, (root @ directions[:MOST_ROWS].T).T.tolist()))

@@ -155,7 +155,7 @@ def _worth_deploying(
         # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
         whole = held_out.whole if found.remainder is not None else held_out.nothing
         held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
-    if found.remainder is None:
+    if found.remainder is None or found.belongs:
         return found, effects, held_out
     whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
     if evidence.is_sparse:
@@ -213,10 +213,10 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
 
     after, searched = rms_without(found.responses), search.criterion.rms(selection.fit)
     effects = []
-    errors = standard_errors(selection.fit)
+    errors = standard_errors(found.fit)
     few = evidence.is_sparse
     if few:
-        errors = with_time_errors(selection.fit, errors)
+        errors = with_time_errors(found.fit, errors)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
         signal = found.responses[i]
 
@@ -268,7 +268,8 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     """
     if found.refitted or not effects:
         return [effect.effect for effect in effects]
-    rows = dict(zip(map(id, found.terms), std_factors(found.selection.fit, found.terms), strict=True))
+    factors = std_factors(found.fit, found.terms, beside_own_error=found.belongs)
+    rows = dict(zip(map(id, found.terms), factors, strict=True))
     # Rows belong together by their place: those of effects that the model has already come first.
     before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
     return [

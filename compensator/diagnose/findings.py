@@ -14,6 +14,7 @@ from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
+from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import Search, Selection
 from compensator.model.effects.blocks import Lag
@@ -38,12 +39,16 @@ class Findings:
         The search, with its data.
     selection : Selection
         What it found.
+    fit : Fit
+        Its effects as they are deployed.
     terms : tuple of Term
         Effects as the engine runs them.
     responses : tuple of numpy.ndarray, shape (n,)
         What each adds to y on every sample, µm.
     remainder : Regressed or None
-        What the channels explain beyond them, where that is worth deploying.
+        What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
+    belongs : bool
+        Whether the remainder is that own error, with which the effects were fitted.
     explains : bool
         Whether the named effects are deployed. Where all channels together explain the data clearly better without
         them, their names say what resembles it most, and the remainder is deployed in their place.
@@ -57,9 +62,11 @@ class Findings:
 
     search: Search
     selection: Selection
+    fit: Fit
     terms: tuple[Term, ...]
     responses: tuple[Vector, ...]
     remainder: Regressed | None
+    belongs: bool
     explains: bool
     ceiling: Vector
     paths: Vector
@@ -106,24 +113,41 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
     fit, points = selection.fit, search.points
-    terms, responses = as_deployed(fit)
     nothing = np.zeros(points.count)
     background = Background(evidence)
     ceiling = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
     remainder, explains = (None, True) if late_term(fit) else _remainder(search, fit, background, refitted, ceiling)
+    belongs = remainder is None and _has_own_error(fit)
+    fit = foretelling(fit) if belongs else fit
+    terms, responses, beside = as_deployed(fit)
+    if belongs:
+        remainder = own_error(beside)
     return Findings(
         search=search,
         selection=selection,
+        fit=fit,
         terms=terms,
         responses=tuple(responses),
         remainder=remainder,
+        belongs=belongs,
         explains=explains,
         ceiling=ceiling.added,
         paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
         refitted=refitted,
     )
+
+
+def _has_own_error(fit: Fit) -> bool:
+    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact.
+
+    What the engine leaves of a dead time of T_Q is what it could not foretell, and no error of the paths.
+    """
+    points, late = fit.likelihood.points, late_term(fit)
+    deployable = any(term.effect.deployable for term in fit.terms)
+    foretold = late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
+    return deployable and not foretold and not points.is_exact and not points.evidence.is_sparse
 
 
 def _remainder(
@@ -147,8 +171,9 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    # Where nothing is known of the paths, the names carry the whole deformation into states that were not seen.
-    charge = search.criterion.charge(fit) + WORTH * evidence.free_paths
+    # A name costs something, its deployment does not. But where nothing is known of the paths, names carry the whole
+    # deformation into states that were not seen.
+    charge = search.criterion.charge(fit) + WORTH if evidence.free_paths else 0.0
     if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - charge:
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, factor_of, learned_rest, solution
-from compensator.diagnose.points import Points, Rest, raw_columns
+from compensator.diagnose.points import Rest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place
 
@@ -130,20 +130,21 @@ def late_term(fit: Fit) -> Term | None:
     return next((term for term in fit.terms if term.effect.lateness is not None), None)
 
 
-def as_deployed(fit: Fit) -> tuple[tuple[Term, ...], list[Vector]]:
-    """Return the terms of a fit as the engine runs them, and what each adds to y on every sample, µm.
+def as_deployed(fit: Fit) -> tuple[tuple[Term, ...], list[Vector], Fit]:
+    """Return the terms of a fit as the engine runs them, what each adds to y on every sample, µm, and their fit.
 
     A late T_Q is found with the future of the record, which the engine does not have. Here it is corrected as the
     engine does, and the other effects are fitted to the corrected signals, which they get there.
     """
-    late, evidence = late_term(fit), fit.likelihood.points.evidence
+    late, points = late_term(fit), fit.likelihood.points
     if late is None:
-        return fit.terms, [response(evidence, term) for term in fit.terms]
-    corrected, added = evidence.corrected(late.effect)
+        return fit.terms, [response(points.evidence, term) for term in fit.terms], fit
+    corrected, added = points.evidence.corrected(late.effect)
     starts = [term.start for term in fit.terms if term is not late]
-    others = iter(fit_terms(Likelihood(Points(corrected), fit.rest), starts).terms)
+    beside = fit_terms(Likelihood(points.of(corrected), fit.rest), starts)
+    others = iter(beside.terms)
     terms = tuple(late if term is late else next(others) for term in fit.terms)
-    return terms, [added if term is late else response(corrected, term) for term in terms]
+    return terms, [added if term is late else response(corrected, term) for term in terms], beside
 
 
 @dataclass(frozen=True, slots=True)

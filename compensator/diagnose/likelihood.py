@@ -117,6 +117,10 @@ class Likelihood:
         """Return the most probable weights of `Points.random` beside effects that add so much to the points."""
         return -self.left_by(added)[self.points.count :]
 
+    def weights_root(self) -> Matrix:
+        """Return a root of the covariance of these weights, beside effects that are as they are."""
+        return np.asarray(np.linalg.inv(self._factor).T)
+
     def projected(self, table: Matrix) -> Matrix:
         """Return averaged columns without noise correlation, nuisances and own error."""
         white = self._whitening.of(table)

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.blocks import FilterBank, Lag, lag_or_none
 from compensator.model.effects.hypothesis import Context, Hypothesis
 
 #: Points that the samples are averaged to.
@@ -93,6 +93,10 @@ class Points:
     ----------
     evidence : Evidence
         Residual and signals.
+    foretells : bool
+        Whether the fit is to foretell other days: then each lag of an own error, and of an effect with several, has a
+        gain at rest of one expected size, so that what moved little in the record is expected to be small. Otherwise
+        every distinct response of the own error may be as large as any other: what the base may miss has no name.
 
     Attributes
     ----------
@@ -122,8 +126,8 @@ class Points:
         Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
     """
 
-    def __init__(self, evidence: Evidence) -> None:
-        self.evidence = evidence
+    def __init__(self, evidence: Evidence, *, foretells: bool = False) -> None:
+        self.evidence, self._foretells = evidence, foretells
         context = evidence.context
         self.is_exact = not context.approximate or evidence.free_paths
         # The same for all data and for what is left where something is held out.
@@ -148,13 +152,17 @@ class Points:
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.own_um = self._own_um()
         self.typical_logs = self._typical_logs(stride)
-        self.fast, self.slow = self._own_columns()
-        self._forms: dict[str, Matrix] = {}
+        self.fast, self.slow, self._by_paths = self._own_columns()
+        self._forms: dict[str, tuple[Matrix, Matrix]] = {}
         self._known: dict[tuple[Hypothesis, tuple[float, ...]], Matrix] = {}
         nuisances = self.averaged(evidence.nuisances)
         self.is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
         self.zeros = ZERO_TIMES * self.spread_um * nuisances[:, self.is_zero]
         self.starts_of_modes = nuisances[:, ~self.is_zero]
+
+    def of(self, evidence: Evidence, *, foretells: bool | None = None) -> Points:
+        """Return the points of other evidence, or those of it that foretell."""
+        return Points(evidence, foretells=self._foretells if foretells is None else foretells)
 
     def _own_um(self) -> float:
         evidence = self.evidence
@@ -215,6 +223,8 @@ class Points:
             How many of the columns belong to one effect.
         """
         spread = np.std(points, axis=0)
+        if self._foretells:
+            spread = np.full(spread.shape, np.max(spread, initial=0.0))
         spread[spread < 1e-12] = 1.0
         scale = self.spread_um / spread
         if sizes:
@@ -248,42 +258,66 @@ class Points:
         starts, forms = rest.start_um * self.starts_of_modes, [size * self.form(name) for name, size in rest.forms]
         return np.concatenate([self.zeros, starts, rest.fast_um * self.fast, rest.own_um * self.slow, *forms], axis=1)
 
+    def made_of(self, rest: Rest) -> list[tuple[str, Matrix]]:
+        """Return what the columns of `random` behind the initial states are made of, in their order.
+
+        For each input its name, a path or a channel, and the gains behind `lags_of_paths`, shape (lags, columns).
+        """
+        sizes = (rest.fast_um, rest.own_um)
+        paths = [(name, size * gains) for by, size in zip(self._by_paths, sizes, strict=True) for name, gains in by]
+        return paths + [(name, size * self._form(name)[1]) for name, size in rest.forms]
+
     def form(self, channel: str) -> Matrix:
         """Return responses of any linear path from a channel, of size 1 together."""
+        return self._form(channel)[0]
+
+    def _form(self, channel: str) -> tuple[Matrix, Matrix]:
         if channel not in self._forms:
-            self._forms[channel] = self._responses([record.channels[channel] for record in self.evidence.signals])[2]
+            lags, table = self._lagged([record.channels[channel] for record in self.evidence.signals])
+            self._forms[channel] = self._distinct(table, np.eye(lags.size))
         return self._forms[channel]
 
     def log_prior(self, rest: Rest) -> float:
         """Return the logarithm of the prior of a rest."""
         return -0.5 * float(np.sum(((rest.logs - self.typical_logs) / REST_FOLDS) ** 2))
 
-    def _own_columns(self) -> tuple[Matrix, Matrix]:
-        """Return fast and slow responses of any linear paths to heat and ambient temperature, of size 1 each."""
-        records = self.evidence.signals
-        both = [self._responses([record.source(path) for record in records]) for path in self.evidence.context.paths]
-        fast, slow, _ = zip(*both, strict=True)
-        return np.concatenate(fast, axis=1), np.concatenate(slow, axis=1)
+    def _own_columns(self) -> tuple[Matrix, Matrix, tuple[list[tuple[str, Matrix]], list[tuple[str, Matrix]]]]:
+        """Return fast and slow responses of any linear paths to heat and ambient temperature, of size 1 each.
 
-    def _responses(self, drives: Sequence[Vector]) -> tuple[Matrix, Matrix, Matrix]:
-        """Return fast, slow, and all responses to a drive."""
+        And what they are made of: gains of each path.
+        """
+        paths, records = self.evidence.context.paths, self.evidence.signals
+        fast, slow = list[tuple[Matrix, Matrix]](), list[tuple[Matrix, Matrix]]()
+        for path in paths:
+            lags, table = self._lagged([record.source(path) for record in records])
+            each, is_slow = np.eye(lags.size), lags >= FAST_MIN
+            # Without a gain at rest, a fast response is one of timing.
+            fast.append(self._distinct(table, each[:, ~is_slow] - each[:, is_slow][:, :1]))
+            slow.append(self._distinct(table, each[:, is_slow]))
+        by_paths = [list(zip(paths, (gains for _, gains in each), strict=True)) for each in (fast, slow)]
+        columns = [np.concatenate([table for table, _ in each], axis=1) for each in (fast, slow)]
+        return columns[0], columns[1], (by_paths[0], by_paths[1])
+
+    def _lagged(self, drives: Sequence[Vector]) -> tuple[Vector, Matrix]:
+        """Return the lags of any linear path, and a drive behind each of them."""
         context = self.evidence.context
-        taus = np.array(lags_of_paths(context))
-        bank = FilterBank(taus.tolist(), [(1.0,) * taus.size], context.period_min)
-        table = self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
-        slow = table[:, taus >= FAST_MIN]
-        # Without a gain at rest, a fast response is one of timing.
-        fast = table[:, taus < FAST_MIN] - slow[:, :1]
-        return self._orthogonal(fast), self._orthogonal(slow), self._orthogonal(table)
+        lags = lags_of_paths(context)
+        lag = lag_or_none if self._foretells else Lag
+        bank = FilterBank(lags, [(1.0,) * len(lags)], context.period_min, lag)
+        return np.array(lags), self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
 
-    def _orthogonal(self, table: Matrix) -> Matrix:
-        """Return combinations of columns that are orthogonal and together of size 1."""
+    def _distinct(self, table: Matrix, gains: Matrix) -> tuple[Matrix, Matrix]:
+        """Return distinct combinations of responses, orthogonal and together of size 1, and their gains."""
+        table = table @ gains
         if not table.shape[1]:
-            return table
-        table = table / np.maximum(np.std(table, axis=0), 1e-12)
+            return table, gains
+        scale = 1.0 if self._foretells else 1.0 / np.maximum(np.std(table, axis=0), 1e-12)
+        table, gains = table * scale, gains * scale
         _, sizes, directions = np.linalg.svd(table - table.mean(axis=0), full_matrices=False)
         kept = sizes > DISTINCT * sizes[0]
-        return np.asarray(table @ directions[kept].T / sizes[kept] * math.sqrt(self.count / kept.sum()))
+        together = np.linalg.norm(sizes) if self._foretells else sizes[kept] * math.sqrt(kept.sum())
+        combined = directions[kept].T / np.maximum(together, 1e-12) * math.sqrt(self.count)
+        return table @ combined, gains @ combined
 
 
 def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:

@@ -54,7 +54,9 @@ def deviations(fit: Fit) -> list[tuple[float, float]]:
     return found
 
 
-def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...], ...]]:
+def std_factors(
+    fit: Fit, terms: Sequence[Term], *, beside_own_error: bool = False
+) -> list[tuple[tuple[float, ...], ...]]:
     """Return the rows of `Effect.std_factor` of each effect: how all of them may differ together.
 
     The directions are those that move y most in this record, so that few rows say nearly all.
@@ -65,10 +67,15 @@ def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...]
         What the data say of all parameters.
     terms : sequence of Term
         Its effects as the engine runs them, where that refitted them.
+    beside_own_error : bool
+        Whether the own error is deployed beside them and states what is open of it. What one of them has too much the
+        other lacks, so that both are known together: what is open of effects is then that beside an own error as it is.
     """
     if not terms:
         return []
-    slopes, spread = _added_slopes(fit), fit.likelihood.points.evidence.spread_um
+    points, spread = fit.likelihood.points, fit.likelihood.points.evidence.spread_um
+    likelihood = Likelihood(points, fit.rest.without_own_error()) if beside_own_error else fit.likelihood
+    slopes = _added_slopes(fit)
     free = [one for term in fit.terms for one in (*term.hypothesis.free, *[None] * len(term.amplitudes))]
     # What the data leave wholly open is known as well as before them.
     moves = np.std(slopes, axis=0)
@@ -76,7 +83,7 @@ def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...]
         spread / move if one is None else (one.high - one.low) * math.sqrt(1.0 / 12.0)
         for one, move in zip(free, np.maximum(moves, 1e-9 * spread).tolist(), strict=True)
     ]
-    root = _root(fit.likelihood, slopes, np.array(prior))
+    root = _root(likelihood, slopes, np.array(prior))
     _, sizes, directions = np.linalg.svd(slopes @ root, full_matrices=False)
     count = int(np.searchsorted(np.cumsum(sizes**2), (1.0 - UNSTATED) * float(sizes @ sizes))) + 1
     deployed = _values(terms)

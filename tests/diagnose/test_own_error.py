@@ -1,0 +1,84 @@
+"""What the data say of the base's own error is deployed with the effects that were fitted beside it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
+from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.own_error import foretelling, own_error
+from compensator.diagnose.points import Points
+from compensator.diagnose.summary import figures
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import draw, record
+from tests.identify.quill_runs import runs_from
+
+#: As `identify` states it: a base whose paths miss 0.6 µm.
+BASE = dataclasses.replace(load_model("quill"), held_out_rms_um=0.6)
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    """A coolant, and a missing mode of a size that is the base's own error."""
+    return [draw("input", 3, 5.0), draw("missing mode", 4, 0.6)]
+
+
+@pytest.fixture(scope="module")
+def fit(scenarios):
+    columns, _, _ = record(scenarios, 80, 24.0)
+    points = Points(evidence_of(BASE, runs_from(columns)))
+    found = findings_of(points.evidence).selection.fit
+    return foretelling(fit_terms(Likelihood(points, found.rest), found.starts()))
+
+
+def test_it_is_what_the_likelihood_gives_the_base(fit):
+    points, rest, own = fit.likelihood.points, fit.rest, own_error(fit)
+    first = points.zeros.shape[1] + points.starts_of_modes.shape[1]
+    weights = fit.likelihood.weights(fit.added)[first:]
+    given = points.random(rest)[:, first:] @ weights
+    added = points.averaged(own.added[:, None])[:, 0]
+    # A channel acts by its change from the start, and the zero is free.
+    assert np.std(given - added) < 1e-9 * np.std(added) + 1e-9
+    assert set(own.effect.channels) >= {"heat_w", "at_degc"}
+
+
+def test_every_lag_is_expected_to_have_a_gain_of_one_size(fit):
+    points = fit.likelihood.points
+    for name, gains in points.made_of(fit.rest):
+        sizes = np.linalg.norm(gains, axis=1)
+        assert sizes[-1] < 2.0 * np.median(sizes[sizes > 0.0]), name
+    together = points.random(fit.rest)
+    first = points.zeros.shape[1] + points.starts_of_modes.shape[1] + points.fast.shape[1]
+    own = together[:, first : first + points.slow.shape[1]]
+    assert np.sqrt(np.sum(np.var(own, axis=0))) == pytest.approx(
+        fit.rest.own_um * np.sqrt(len(points.evidence.context.paths)), rel=0.02
+    )
+
+
+def test_a_model_with_it_errs_less_on_another_day(scenarios):
+    columns, _, _ = record(scenarios, 80, 24.0)
+    table = {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}
+    why = tc.diagnose(BASE, table)
+    assert [effect.kind for effect in why.effects] == ["input"]
+    *named, own = why.model.effects
+    assert own.kind == "regression" and own.std_factor
+    assert figures(why.diagnosis)["remainder"]["deployed"]
+    fresh, true, _ = record(scenarios, 81, 24.0)
+    errors = []
+    for effects in ((*named, own), named):
+        model = dataclasses.replace(why.model, effects=tuple(effects), sha256="")
+        error = true - tc.simulate(model, {"t_s": 60.0 * np.arange(true.size), **fresh})["y_pred_um"]
+        errors.append(np.std(error))
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios):
+    columns, _, _ = record(scenarios[:1], 82, 12.0)
+    assert findings_of(evidence_of(load_model("quill"), runs_from(columns))).remainder is None
+    columns, _, _ = record([draw("step", 3, 5.0)], 83, 24.0)
+    found = findings_of(evidence_of(BASE, runs_from(columns)))
+    assert [term.hypothesis.place[0] for term in found.terms] == ["step"] and found.remainder is None
