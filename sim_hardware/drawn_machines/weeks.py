@@ -325,4 +325,6 @@ DEVELOPMENT_WEEKS = _weeks(3000, 100)
 #: Each week is run at most once, and none is examined before.
 SEALED_WEEKS = _weeks(880_000, 100)
 #: Each run of some SEALED_WEEKS: their seeds, and date, version, where its figures are.
-SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = ()
+SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = (
+    ((880_000, 880_025, 880_050, 880_075), "2026-11-23, proposals stay; tests/bench/README.md, The loop"),
+)
