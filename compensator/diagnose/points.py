@@ -291,8 +291,9 @@ class Points:
         for path in paths:
             lags, table = self._lagged([record.source(path) for record in records])
             each, is_slow = np.eye(lags.size), lags >= FAST_MIN
-            # Without a gain at rest, a fast response is one of timing.
-            fast.append(self._distinct(table, each[:, ~is_slow] - each[:, is_slow][:, :1]))
+            # Without a gain at rest, a fast response is one of timing; in about an hour every lag is fast.
+            reference = each[:, np.flatnonzero(is_slow)[:1]] if is_slow.any() else each[:, -1:]
+            fast.append(self._distinct(table, each[:, ~is_slow] - reference))
             slow.append(self._distinct(table, each[:, is_slow]))
         by_paths = [list(zip(paths, (gains for _, gains in each), strict=True)) for each in (fast, slow)]
         columns = [np.concatenate([table for table, _ in each], axis=1) for each in (fast, slow)]

@@ -12,7 +12,7 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.summary import figures, verdict
 from compensator.model.model_file import load_model
-from tests.diagnose.scenarios import record
+from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -81,3 +81,12 @@ def test_a_channel_that_moves_only_in_what_is_held_out_predicts_nothing_there():
     evidence = evidence_of(QUILL, runs_from(columns))
     found = findings_of(evidence.without(next(evidence.blocks(3))))
     assert np.ptp(found.ceiling) < 1.0
+
+
+@pytest.mark.parametrize("minutes", [60, 75, 110])
+@pytest.mark.parametrize("approximate", [False, True])
+def test_a_record_of_an_hour_is_diagnosed(minutes, *, approximate):
+    """Every lag that it can tell is fast."""
+    columns = {name: values[:minutes] for name, values in record([draw("input", 3, 5.0)], 80, 24.0)[0].items()}
+    model = dataclasses.replace(QUILL, held_out_rms_um=0.6 if approximate else None)
+    assert diagnose(model, runs_from(columns)).verdict
