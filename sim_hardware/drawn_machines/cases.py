@@ -62,4 +62,5 @@ SEALED = _cases(770_000)
 SEALED_RUNS: tuple[str, ...] = (
     "2026-11-22, after 0.1.0, tests/bench/README.md",
     "2026-11-22, a third of the time and effects known apart, tests/bench/README.md",
+    "2026-11-23, effects deployed with the own error beside them, tests/bench/README.md",
 )
