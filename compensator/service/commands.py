@@ -80,6 +80,8 @@ class Commands:
         self._more = 0
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
         self._refused = 0
+        #: Whether an answer about the candidate of the loop waits for the next sample.
+        self._is_answered = False
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def open(self) -> None:
@@ -119,7 +121,7 @@ class Commands:
 
     def apply(self, compensation: Compensation) -> None:
         """Apply the commands that arrived since the last sample."""
-        self._refused = 0
+        self._refused, self._is_answered = 0, False
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
             self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
@@ -140,11 +142,14 @@ class Commands:
                 raise ServiceError("the configuration has no loop; expected [loop] with a policy")
             if self._loop is None:
                 raise ServiceError("the service is ending")
+            if self._is_answered:
+                raise ServiceError("the candidate was answered already, which acts at the next sample")
             text = self._models.offer(force=request.force or name == CommandName.DISMISS)
         except ServiceError as error:
             self._note_refusal(name, f"{name}: {error}", sender)
             reply.set_result(refusal(f"{name}: {error}"))
             return
+        self._is_answered = True
         self._enqueue(name, {"candidate": True, "force": request.force}, sender)
         text = text if name == CommandName.ADOPT else f"dismissed: {text.replace(' is adopted;', ';')}"
         reply.set_result({"ok": True, "text": f"{text}; acts at the next sample"})

@@ -27,6 +27,9 @@ _HAS: Mapping[str, str] = {
 }
 #: Reasons that name a doubt in the offset itself; others in state degraded are restrictions that pass by themselves.
 _DOUBTS = (Reason.IMPLAUSIBLE, Reason.T_Q_AT_APART, Reason.CORRECTION_LIMITED, Reason.OFFSET_LIMITED)
+#: The model lacks an effect, and what to do where the service has found it.
+_LACKS = f"{Reason.IMPLAUSIBLE}:model"
+_ANSWER = "The service proposes a better model: answer the proposal."
 
 
 class Headline(NamedTuple):
@@ -47,6 +50,7 @@ def headline(
     now_ns: int,
     std_um: float | None = None,
     warnings: Sequence[str] = (),
+    is_proposed: bool = False,
 ) -> Headline:
     """Return the headline of a machine.
 
@@ -66,8 +70,12 @@ def headline(
         Standard deviation of the offset, µm.
     warnings : sequence of str
         What the watch warns about in a state without a reason, the severest first.
+    is_proposed : bool
+        Whether the service proposes a better model: a person answers, instead of looking for one.
     """
     found = _headline(shown, tone, reasons, channels, until_ns, now_ns, warnings)
+    if is_proposed:
+        found = found._replace(text=found.text.replace(_words([_LACKS])[-1], _ANSWER))
     if found.cut == "no" or std_um is None:
         return found
     return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")

@@ -344,6 +344,9 @@ class WatchedMachine:
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
             warnings=list(map(str, sorted(warnings, key=lambda one: one.code not in _SEVERE))),
+            is_proposed=status is not None
+            and not isinstance(status.loop, UnsetType)
+            and status.loop.phase == "proposed",
         )
 
     @staticmethod

@@ -101,3 +101,14 @@ async def test_the_service_keeps_it_over_a_kill_and_a_replay_makes_it_again(tmp_
     assert service.candidates()[-1].verdict == "alike" and service.store.in_use() == QUILL
     assert service.candidates()[-1].model_sha256 == sha256_of(extended())
     checked(service)
+
+
+def test_a_proposal_stays_while_later_diagnoses_find_the_same_effects() -> None:
+    """Whoever reads it in the morning can still say yes at noon."""
+    night = Night(shown(extended()), shown(extended(2.9)), shown(extended(3.1)))
+    loop = LoopRun(settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0}), QUILL, night)
+    steps = run(loop, machine(3 * DAY))
+    found = [decision[1:] for decision in decisions(steps)]
+    after = found[found.index(("propose", "")) + 1 :]
+    assert len(night.asked) >= 4 and loop.phase == "proposed"
+    assert {step for step, _ in after} == {"diagnose", "nothing"} and ("nothing", "in_shadow") in after

@@ -209,6 +209,22 @@ async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_p
     checked(machine)
 
 
+async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(tmp_path: Path) -> None:
+    """Of a yes and a no within a minute only the first acts, and the second is not told that it does."""
+    machine = Looping(tmp_path, shown(extended()), policy="propose")
+    yes, no = Asked(machine, "adopt", candidate=True, force=True), Asked(machine, "dismiss")
+
+    def both() -> None:
+        yes()
+        no()
+
+    machine.at_sample[420] = both
+    await machine.run(480)
+    assert yes.answer["ok"], yes.answer
+    assert not no.answer["ok"] and "answered already" in no.answer["text"], no.answer
+    assert machine.store.in_use() == extended()
+
+
 async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
     no = machine.at_sample[420] = Asked(machine, "dismiss")

@@ -96,3 +96,10 @@ def test_codes_with_a_listed_suffix_have_words_of_their_own() -> None:
         assert None not in found and len(set(found)) == len(SUFFIXES[code]), code
     assert explain("implausible:oil") == (Reason.IMPLAUSIBLE.meaning, Reason.IMPLAUSIBLE.action)
     assert all(code.partition(":")[2] in SUFFIXES[code.partition(":")[0]] for code in SUFFIX_WORDS)
+
+
+def test_while_the_service_proposes_a_model_nobody_is_sent_to_look_for_one() -> None:
+    given: dict[str, Any] = {"shown": "degraded", "tone": "warn", "reasons": ["implausible:model"], "channels": {}}
+    found = headline(**given, until_ns=None, now_ns=NOW_NS, is_proposed=True)
+    assert "diagnose" not in found.text and found.text.endswith("answer the proposal.")
+    assert "`compensator diagnose`" in headline(**given, until_ns=None, now_ns=NOW_NS).text
