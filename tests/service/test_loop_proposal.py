@@ -10,7 +10,7 @@ from compensator.service.loop.place import LEADS
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.transfer.comparison import DEVIATIONS
 from compensator.service.transfer.model_store import sha256_of
-from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
+from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
 from tests.service.test_loop_run import CHECKED, NIGHT
 from tests.service.test_loop_service import Looping, checked, in_phase
 from tests.service.test_restart import QUILL
@@ -112,3 +112,13 @@ def test_a_proposal_stays_while_later_diagnoses_find_the_same_effects() -> None:
     after = found[found.index(("propose", "")) + 1 :]
     assert len(night.asked) >= 4 and loop.phase == "proposed"
     assert {step for step, _ in after} == {"diagnose", "nothing"} and ("nothing", "in_shadow") in after
+
+
+def test_a_proposal_stays_while_later_diagnoses_find_others_until_nobody_has_answered_for_long() -> None:
+    night = Night(shown(extended()), shown(stronger(0.1)))
+    loop = LoopRun(settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0, "watch_h": 36.0}), QUILL, night)
+    steps = run(loop, machine(3 * DAY))
+    found = [decision[1:] for decision in decisions(steps)]
+    after = found[found.index(("propose", "")) + 1 :]
+    until = after.index(("end", "no_answer"))
+    assert ("nothing", "waits") in after[:until] and {step for step, _ in after[:until]} == {"diagnose", "nothing"}

@@ -140,7 +140,8 @@ class Loop:
         if is_candidate and is_limited(other) and not is_limited(present):
             return self._end(name, "limits")
         if now_ns - place.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
-            return self._end(name, "no_difference" if is_candidate else "watched")
+            unshown = "no_answer" if place.is_proposed else "no_difference"
+            return self._end(name, unshown if is_candidate else "watched")
         is_waiting = is_candidate and not place.is_proposed
         if state.clean_min < CLEAN_MIN or not (judge or is_waiting):
             return []

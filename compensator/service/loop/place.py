@@ -53,11 +53,11 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
+    # A person who reads a proposal must still find it when answering: whatever is newer comes after the answer.
+    if settings.policy == "propose" and state.candidate is not None and state.candidate.is_proposed:
+        return "in_shadow" if takes_over(state, role, found.effects) else "waits"
     if takes_over(state, role, found.effects):
         assert state.candidate is not None
-        # A person who reads a proposal must still find it when answering: newer parameters come after the answer.
-        if settings.policy == "propose" and state.candidate.is_proposed:
-            return "in_shadow"
         # What gave its place too often would never be compared for its own hours.
         return "in_shadow" if now_ns - state.candidate.since_utc_ns < settings.shadow_h * _HOUR_NS else ""
     return "waits" if state.exchange else ""

@@ -12,7 +12,7 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
-#: Version of the state; another one is refused.
+#: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
 STATE_SCHEMA = 1
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]

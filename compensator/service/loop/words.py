@@ -11,6 +11,7 @@ def ended(why: str, verdict: ComparisonData) -> str:
     return {
         "limits": "the candidate reaches limits that the present model keeps",
         "worse": f"the candidate is worse: {described(verdict)}",
+        "no_answer": f"nobody answered the proposal: {described(verdict)}",
         "no_difference": f"the candidate shows no clear difference: {described(verdict)}",
         "watched": f"the model before is no longer compared: {described(verdict)}",
         "dismissed": "the candidate is dismissed by an operator",
@@ -28,6 +29,6 @@ def nothing_follows(why: str, found: DiagnosisData) -> str:
         "unchanged": f"the diagnosis finds what the model has: {effects}",
         "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
         "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
-        "waits": f"{effects}: waits while another model takes over or is compared; looked for again later",
+        "waits": f"{effects}: waits while another model takes over, or is proposed; looked for again later",
     }
     return words[why].rstrip("; ")
