@@ -254,12 +254,13 @@ async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_t
 async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_operators_yes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine = Looping(tmp_path, shown(extended()), shown(extended(2.0)), policy="propose")
-    await machine.run(1800, until=in_phase(machine, "proposed"))
+    machine = Looping(tmp_path, shown(extended()), shown(stronger(0.1)), policy="propose")
+    machine.use(machine.config_bytes.replace(b"shadow_h = 6.0", b"shadow_h = 48.0"))
+    await machine.run(1800, until=in_phase(machine, "shadow"))
     works, adopted, warmed = live.warm_up, threading.Event(), threading.Event()
 
     def late(*arguments: Any, **settings: Any) -> Any:
-        machine.at_sample[len(machine.outcomes) + 5] = Asked(machine, "adopt", candidate=True)
+        machine.at_sample[len(machine.outcomes) + 5] = Asked(machine, "adopt", candidate=True, force=True)
         machine.waits_for_diagnoses = False
         found = works(*arguments, **settings)
         assert adopted.wait(60.0)
