@@ -65,11 +65,6 @@ class PlannedOutput:
         """Its name, such as `z`, `a` or `y_slope`."""
         return self.output.name
 
-    @property
-    def is_slope(self) -> bool:
-        """Whether it is the slope of an axis."""
-        return self.unit == "um_per_m"
-
     def named(self, name: str) -> str:
         """Return the name of one of its values, such as `z_pred_um`; that of its measured value is `z_um`."""
         return "_".join(filter(None, (self.name, name, self.unit)))

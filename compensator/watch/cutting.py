@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from compensator.codes import Reason, SampleQuality, State, WatchWarning, explain
@@ -73,9 +74,8 @@ def headline(
     is_proposed : bool
         Whether the service proposes a better model: a person answers, instead of looking for one.
     """
-    found = _headline(shown, tone, reasons, channels, until_ns, now_ns, warnings)
-    if is_proposed:
-        found = found._replace(text=found.text.replace(_words([_LACKS])[-1], _ANSWER))
+    words = partial(_words, is_proposed=is_proposed)
+    found = _headline(shown, tone, reasons, channels, until_ns, now_ns, warnings, words)
     if found.cut == "no" or std_um is None:
         return found
     return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")
@@ -89,16 +89,17 @@ def _headline(
     until_ns: int | None,
     now_ns: int,
     warnings: Sequence[str],
+    words: Callable[[Sequence[str]], list[str]],
 ) -> Headline:
     if shown == State.STARTING and list(reasons[:1]) == [Reason.NO_ZERO]:
         # Reason and state say the same; what to do at a start is to wait.
-        return Headline("no", "Do not cut to size", f"{_words(reasons[:1])[0]} {State.STARTING.action}")
+        return Headline("no", "Do not cut to size", f"{words(reasons[:1])[0]} {State.STARTING.action}")
     if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
-        return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
+        return Headline("no", "Do not cut to size", " ".join(words([*reasons[:1], shown])))
     lost = _lost(channels, reasons)
     doubts = [reason for reason in reasons if reason.partition(":")[0] in _DOUBTS]
     if shown == State.HOLD:
-        why = lost or _words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
+        why = lost or words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
         frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
         return Headline("no", "Do not cut to size", " ".join([*frozen, *why]))
     if Reason.PREDICTING in reasons:
@@ -106,7 +107,7 @@ def _headline(
             return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))
         minutes = max(until_ns - now_ns, 0) / 60e9
         held = f"Predicted for another {minutes:.0f} min, then held."
-        parts = [*lost[:1], held, *lost[1:], *_words(doubts[:1])[:1]]
+        parts = [*lost[:1], held, *lost[1:], *words(doubts[:1])[:1]]
         may = "Cut with care" if doubts else "May cut"
         return Headline("until", f"{may} until {here(until_ns):%H:%M}", " ".join(parts))
     suspects = [reason.partition(":")[2] for reason in reasons if reason.startswith(f"{Reason.IMPLAUSIBLE}:")]
@@ -117,11 +118,11 @@ def _headline(
         text = f"Measured and predicted Y diverge; not known yet whether {causes}."
         return Headline("care", "Cut with care", f"{text} {SEVERAL_SUSPECTS}")
     if doubts:
-        return Headline("care", "Cut with care", " ".join(_words(doubts[:1])))
+        return Headline("care", "Cut with care", " ".join(words(doubts[:1])))
     if reasons:
-        return Headline("care", "Cut with care", " ".join([*lost, *([] if lost else _words(reasons[:1]))]))
+        return Headline("care", "Cut with care", " ".join([*lost, *([] if lost else words(reasons[:1]))]))
     if tone != "good":
-        return Headline("care", "Cut with care", " ".join(warnings[:1] or _words([shown])))
+        return Headline("care", "Cut with care", " ".join(warnings[:1] or words([shown])))
     return Headline("yes", "May cut", "The offset follows the model.")
 
 
@@ -145,7 +146,10 @@ def _lost(channels: Mapping[str, Mapping[str, Any]], reasons: Sequence[str]) -> 
     return [" ".join(causes), *dict.fromkeys(filter(None, to_do))]
 
 
-def _words(codes: Sequence[str]) -> list[str]:
+def _words(codes: Sequence[str], *, is_proposed: bool) -> list[str]:
     """Return meaning and action of codes, each sentence once."""
-    found = [part for code in codes for part in (explain(code) or (code, ""))]
+    found = []
+    for code in codes:
+        meaning, action = explain(code) or (code, "")
+        found += [meaning, _ANSWER if is_proposed and code == _LACKS else action]
     return list(dict.fromkeys(part for part in found if part not in ("", "See the reasons.")))
