@@ -73,7 +73,7 @@ class Control:
             assert alive(), "LinuxCNC ended while starting"
             return Path(self._path).exists()
 
-        until(there, STARTS, 60.0)
+        until(there, STARTS)
         until(self._try, "the panel answers")
         self._socket.settimeout(ANSWER_S)
         self._lines = self._socket.makefile("rw")

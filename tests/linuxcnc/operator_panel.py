@@ -21,7 +21,7 @@ if __name__ == "__main__":
     panel = hal.component("panel")
     panel.ready()
 
-    def until(condition, what, timeout_s=30.0):
+    def until(condition, what, timeout_s=120.0):
         end = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > end:

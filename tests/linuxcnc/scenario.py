@@ -363,7 +363,7 @@ def service(folder: Path) -> None:
             until(stands, "the axis stands")
             return seen[-1]
 
-        until(lambda: witness.messages and abs(witness.messages[-1][1]["y_offset_um"] or 0.0) > 0.3, "an offset", 90.0)
+        until(lambda: witness.messages and abs(witness.messages[-1][1]["y_offset_um"] or 0.0) > 0.3, "an offset")
         control.do("mdi", "G0 Y0")
         follows()
         in_motion(bench.program(lambda: None))
@@ -458,7 +458,7 @@ def _probed(bench: Bench, service: ScriptedService, process: subprocess.Popen[st
 
     def run() -> None:
         control.do("start", str(part))
-        until(lambda: not control.do("running"), "the program's end", 120.0)
+        until(lambda: not control.do("running"), "the program's end")
 
     for seq, (deformation_um, offset_um) in enumerate(((12.0, -8.0), (12.0, 0.0), (-5.0, 3.0)), 1):
         service.put(seq, offset_um)

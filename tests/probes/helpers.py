@@ -38,7 +38,7 @@ def touch_um(*, y_um: float, offset_um: float, includes_offset: bool = False) ->
     return slide if includes_offset else slide - offset_um
 
 
-async def until(condition: Callable[[], Any], what: str | Callable[[], str], timeout_s: float = 30.0) -> None:
+async def until(condition: Callable[[], Any], what: str | Callable[[], str], timeout_s: float = 120.0) -> None:
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, f"not within {timeout_s} s: {what if isinstance(what, str) else what()}"

@@ -159,7 +159,7 @@ class ScriptedService:
         self.close()
 
 
-def until(condition: Callable[[], object], what: str | Callable[[], str], timeout_s: float = 40.0) -> None:
+def until(condition: Callable[[], object], what: str | Callable[[], str], timeout_s: float = 120.0) -> None:
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, f"not within {timeout_s} s: {what if isinstance(what, str) else what()}"

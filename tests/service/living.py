@@ -6,9 +6,7 @@ import asyncio
 import functools
 import math
 import shutil
-import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +31,10 @@ from compensator.service.replay import apply, opening_of, steps_of
 from compensator.service.transfer.model_store import ModelStore, check_model
 from compensator.service.transfer.restart import resume
 from sim_hardware.physics import Duty, PublishedQuill, World
+from tests.service.promises import Promises
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 
 MACHINE = "vmc-07"
-#: Processor time that the thread of a command gets in each sample, s; the clock would give it less on a busy computer.
-PATIENCE_S = 0.02
-#: Real seconds of a sample after which that thread is not working, but waiting for the next sample.
-IDLE_S = 0.4
 
 
 def settings(**changes: Any) -> Config:
@@ -64,27 +59,18 @@ class Machine:
         self.at_sample: dict[int, Callable[[], Any]] = {}
         self.daemon: Daemon | None = None
 
-        #: Promises of commands; while one is open simulated time does not run away from the thread that works on it.
-        self.promised: list[Future[Any]] = []
+        self.promises = Promises()
         #: Whether simulated time waits for diagnoses and what follows from them.
         self.waits_for_diagnoses = True
         self.at_poll: Callable[[], Any] = lambda: None
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
-            part = self.config.sampling.poll_interval_s / 60.0
-            worked_s, idle_s = time.process_time() + PATIENCE_S * part, time.monotonic() + IDLE_S * part
-            while self.is_promised and time.process_time() < worked_s and time.monotonic() < idle_s:
-                await asyncio.sleep(0.002)
+            await self.promises.wait(self.config.sampling.poll_interval_s / 60.0)
             while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
                 await asyncio.sleep(0.002)
 
         self.clock = VirtualClock(start_ns, advance)
-
-    @property
-    def is_promised(self) -> bool:
-        self.promised = [promise for promise in self.promised if not promise.done()]
-        return bool(self.promised)
 
     @property
     def recordings(self) -> Path:
@@ -96,10 +82,7 @@ class Machine:
 
     def command(self, name: str, payload: bytes = b"") -> Any:
         assert self.daemon is not None
-        reply = self.daemon.command(name, payload)
-        if isinstance(reply, Future):
-            self.promised.append(reply)
-        return reply
+        return self.promises.add(self.daemon.command(name, payload))
 
     async def diagnose(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
         """Stand in for the process of a diagnosis."""

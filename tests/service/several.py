@@ -32,6 +32,7 @@ from compensator.service.transfer.restart import resume
 from sim_hardware.physics import Duty, MachineOfAxes, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.axes import USUAL
 from tests.audit.made import CONFIG as ONE_AXIS
+from tests.service.promises import Promises
 from tests.service.simulated import START_NS, FakeDevice
 
 MACHINE = "vmc-07"
@@ -126,13 +127,11 @@ class SeveralAxes:
         self.outcomes: list[Outcome] = []
         self.published: list[tuple[str, bytes]] = []
         self.daemon: Daemon | None = None
-        self.waits: list[Any] = []
+        self.promises = Promises(patience_s=0.1)
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
-            self.waits = [promise for promise in self.waits if not promise.done()]
-            if self.waits:
-                await asyncio.sleep(0.01)
+            await self.promises.wait(self.config.sampling.poll_interval_s / 60.0)
 
         self.clock = VirtualClock(START_NS, advance)
 
@@ -192,10 +191,7 @@ class SeveralAxes:
     def command(self, name: str, payload: bytes = b"") -> Any:
         """Send a command; simulated time waits for what takes long."""
         assert self.daemon is not None
-        reply = self.daemon.command(name, payload)
-        if not isinstance(reply, dict):
-            self.waits.append(reply)
-        return reply
+        return self.promises.add(self.daemon.command(name, payload))
 
     def sent(self, topic: str) -> list[dict[str, Any]]:
         """What was published under a name, decoded."""

@@ -363,7 +363,7 @@ async def test_a_model_that_takes_for_ever_does_not_keep_the_service_from_ending
 
     def ask() -> None:
         asked()
-        machine.promised.clear()  # simulated time does not wait for it
+        machine.promises.open.clear()  # simulated time does not wait for it
 
     machine.at_sample[20] = ask
     machine.at_sample[22] = lambda: at_work.wait(20.0)
