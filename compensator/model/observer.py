@@ -29,7 +29,7 @@ Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential upd
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -82,6 +82,28 @@ class Forecast:
     t_q_std_k: float
     at_k: float
     at_std_k: float
+
+
+@dataclass(slots=True)
+class _Ahead:
+    """What follows from a covariance alone, as far as it has been asked for.
+
+    Parameters
+    ----------
+    of : numpy.ndarray, shape (n, n)
+        The covariance after a sample; never changed once it is set.
+    p : numpy.ndarray, shape (n, n)
+        That of one sample later, before its measurements.
+    with_at : tuple of list of float and numpy.ndarray, optional
+        Gain of an AT that is measured then, and the covariance with it.
+    t_q_std : dict of bool to float
+        Standard deviation of what T_Q will measure, K, with AT measured and without.
+    """
+
+    of: Matrix
+    p: Matrix
+    with_at: tuple[list[float], Matrix] | None = None
+    t_q_std: dict[bool, float] = field(default_factory=dict)
 
 
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
@@ -151,8 +173,9 @@ class Observer:
         rows += [(self._q, nil, nil, 0.0, 0.0), (self._a, nil, nil, 0.0, 0.0)]
         self._rows = rows
         next_row, first_row, source_row, a_column, b_column = (np.array(column) for column in zip(*rows, strict=True))
-        self._next_row, self._first_row, self._source_row = next_row, first_row, source_row
-        self._a_column, self._b_column = a_column[:, None], b_column[:, None]
+        self._gathered = np.array((next_row, first_row, source_row))
+        self._factors = np.array((a_column, b_column))[:, :, None]
+        self._padded: Matrix = np.zeros((self.size + 1, self.size))
 
     def _paths_of(self, part: int) -> tuple[int, int]:
         """Return the numbers of DTF and TDTF of a part of the model; 0 is the first."""
@@ -176,6 +199,7 @@ class Observer:
         """Return to rest: every state zero and known."""
         self._x = [0.0] * (self.size + 1)
         self._P: Matrix = np.zeros((self.size, self.size))
+        self._ahead = _Ahead(of=self._P, p=self._P)
         self._settled = False
         self._started = False
         self._steady: tuple[list[float], list[float]] = ([], [])
@@ -237,13 +261,18 @@ class Observer:
             AT of that sample as a change from its reference, K, from which T_Q is then expected; NaN where missing.
         """
         x = self._moved(self._x) if self._started else self._x
-        p = self._moved_covariance(self._P) if self._started else self._P
+        ahead = self._moved_ahead()
+        p, has_at = ahead.p, not math.isnan(at_k)
         at_expected, at_variance = x[self._a], float(p[self._a, self._a]) + self._r_at
-        if not math.isnan(at_k):
-            gain, p = self._update_at(p, self._r_at)
-            x = [*(value + k * (at_k - at_expected) for value, k in zip(x, gain, strict=False)), 0.0]
-        _, t_q_variance = self._t_q_column(p, self._r_tq)
-        return Forecast(self._t_q_of(x), math.sqrt(max(t_q_variance, 0.0)), at_expected, math.sqrt(at_variance))
+        if has_at:
+            gain, p = self._ahead_with_at()
+            innovation = at_k - at_expected
+            x = [value + k * innovation for value, k in zip(x, gain, strict=False)]
+            x.append(0.0)
+        t_q_std = ahead.t_q_std.get(has_at)
+        if t_q_std is None:
+            t_q_std = ahead.t_q_std[has_at] = math.sqrt(max(self._t_q_column(p, self._r_tq)[1], 0.0))
+        return Forecast(self._t_q_of(x), t_q_std, at_expected, math.sqrt(at_variance))
 
     def drive_for(self, t_q_k: float) -> float:
         """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
@@ -254,11 +283,11 @@ class Observer:
     def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
         """Propagate the covariance by one sample and return the gains for AT and T_Q (None: missing)."""
         before = self._P
-        p = self._moved_covariance(before) if self._started else before
+        p = self._moved_ahead().p
         gain_at: list[float] = []
         gain_tq: list[float] = []
         if r_at is not None:
-            gain_at, p = self._update_at(p, r_at)
+            gain_at, p = self._ahead_with_at() if r_at == self._r_at else self._update_at(p, r_at)
         if r_tq is not None:
             gain_tq, p = self._update_t_q(p, r_tq)
         self._P = p
@@ -275,19 +304,34 @@ class Observer:
         return gain_at, gain_tq
 
     def _f_times(self, matrix: Matrix) -> Matrix:
-        rows = np.zeros((self.size + 1, self.size))
-        rows[:-1] = matrix
-        following, first, source = (rows.take(of, axis=0) for of in (self._next_row, self._first_row, self._source_row))
-        product: Matrix = following - self._a_column * first + self._b_column * source
+        self._padded[:-1] = matrix
+        rows = self._padded.take(self._gathered, axis=0)
+        rows[1:] *= self._factors
+        product: Matrix = rows[0]
+        product -= rows[1]
+        product += rows[2]
         return product
 
     def _moved_covariance(self, p: Matrix) -> Matrix:
         moved = self._f_times(self._f_times(p).T)
         # Symmetric to the bit, because a snapshot keeps the upper triangle only.
         flat = moved.reshape(-1)
-        flat[self._lower] = flat[self._upper]
+        flat.put(self._lower, flat.take(self._upper))
         flat[:: self.size + 1] += self._walk
         return moved
+
+    def _moved_ahead(self) -> _Ahead:
+        """Return the covariance one sample ahead, which forecasts and the next sample share."""
+        if self._ahead.of is not self._P:
+            self._ahead = _Ahead(of=self._P, p=self._moved_covariance(self._P) if self._started else self._P)
+        return self._ahead
+
+    def _ahead_with_at(self) -> tuple[list[float], Matrix]:
+        """Return the gain of an AT that was measured, and the covariance one sample ahead with it."""
+        ahead = self._moved_ahead()
+        if ahead.with_at is None:
+            ahead.with_at = self._update_at(ahead.p, self._r_at)
+        return ahead.with_at
 
     def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
         column = p[:, self._a]
@@ -320,12 +364,13 @@ class Observer:
         return gain.tolist(), _corrected(p, gain, column, s)
 
     def _has_settled(self, before: Matrix) -> bool:
-        deviation = np.sqrt(np.maximum(self._P.diagonal(), 0.0))
+        variances = self._P.diagonal()
+        deviation = np.sqrt(np.maximum(variances, 0.0))
         # The variances alone show most of the way that it has not.
-        if np.any(np.abs(self._P.diagonal() - before.diagonal()) > SETTLED * (deviation * deviation)):
+        if (np.abs(variances - before.diagonal()) > SETTLED * (deviation * deviation)).any():
             return False
         scale = np.multiply.outer(deviation, deviation)
-        return bool(np.all(np.abs(self._P - before) <= SETTLED * scale))
+        return bool((np.abs(self._P - before) <= SETTLED * scale).all())
 
     def _variance_of_y(self) -> float:
         return _variance(self._of_y, self._P.tolist())
@@ -399,7 +444,7 @@ class Observer:
 
     def covariance_ahead(self) -> Matrix:
         """Return the covariance one sample ahead, before its measurements."""
-        return self._moved_covariance(self._P) if self._started else self._P
+        return self._moved_ahead().p
 
     def widen(self, ahead: Matrix) -> None:
         """Set the covariance after a gap whose inputs were interpolated.
