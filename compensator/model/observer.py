@@ -30,6 +30,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +41,9 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 #: P counts as settled when no element moves by more than this, relative to its standard deviations.
 SETTLED = 1e-7
+
+#: So many steps of the covariance are kept for each of so many designs: it is the same in every run from rest.
+_KEPT_STEPS, _KEPT_DESIGNS = 4096, 4
 
 _UNITY = SampledTransferFunction(b=(1.0,), a=(1.0,), period_s=60.0)
 _ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
@@ -92,7 +97,7 @@ class _Ahead:
     ----------
     of : numpy.ndarray, shape (n, n)
         The covariance after a sample; never changed once it is set.
-    p : numpy.ndarray, shape (n, n)
+    p : numpy.ndarray, shape (n, n), optional
         That of one sample later, before its measurements.
     with_at : tuple of list of float and numpy.ndarray, optional
         Gain of an AT that is measured then, and the covariance with it.
@@ -101,9 +106,37 @@ class _Ahead:
     """
 
     of: Matrix
-    p: Matrix
+    p: Matrix | None = None
     with_at: tuple[list[float], Matrix] | None = None
     t_q_std: dict[bool, float] = field(default_factory=dict)
+
+
+class _Step(NamedTuple):
+    """A step of the covariance, which depends on no measured value: shared by all observers of the same design.
+
+    Parameters
+    ----------
+    ahead : _Ahead
+        Covariance after the sample, and what follows from it.
+    gain_at, gain_tq : list of float
+        Gains for AT and T_Q; empty where missing.
+    y_var : float
+        Variance of y, µm².
+    settled : bool
+        Whether the covariance has reached its steady value.
+    """
+
+    ahead: _Ahead
+    gain_at: list[float]
+    gain_tq: list[float]
+    y_var: float
+    settled: bool
+
+
+@lru_cache(maxsize=_KEPT_DESIGNS)
+def _steps_of(design: tuple[object, ...]) -> dict[tuple[object, ...], _Step]:
+    """Return the steps that observers of a design have made."""
+    return {}
 
 
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
@@ -150,6 +183,8 @@ class Observer:
         #: States of y and their weights.
         weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
         self._of_y = [(index, weight) for index, weight in weights if index < self.size]
+        noise = (self._kalman, self._r_tq, self._r_at, *self._walk.tolist())
+        self._steps = _steps_of((noise, tuple(self._rows), tuple(self._first), tuple(self._d), tuple(self._of_y)))
         self.reset()
 
     def _lay_out(self, *functions: SampledTransferFunction) -> None:
@@ -199,7 +234,7 @@ class Observer:
         """Return to rest: every state zero and known."""
         self._x = [0.0] * (self.size + 1)
         self._P: Matrix = np.zeros((self.size, self.size))
-        self._ahead = _Ahead(of=self._P, p=self._P)
+        self._ahead = _Ahead(self._P)
         self._settled = False
         self._started = False
         self._steady: tuple[list[float], list[float]] = ([], [])
@@ -261,17 +296,16 @@ class Observer:
             AT of that sample as a change from its reference, K, from which T_Q is then expected; NaN where missing.
         """
         x = self._moved(self._x) if self._started else self._x
-        ahead = self._moved_ahead()
-        p, has_at = ahead.p, not math.isnan(at_k)
+        p, has_at = self._moved_ahead(), not math.isnan(at_k)
         at_expected, at_variance = x[self._a], float(p[self._a, self._a]) + self._r_at
         if has_at:
             gain, p = self._ahead_with_at()
             innovation = at_k - at_expected
             x = [value + k * innovation for value, k in zip(x, gain, strict=False)]
             x.append(0.0)
-        t_q_std = ahead.t_q_std.get(has_at)
+        t_q_std = self._ahead.t_q_std.get(has_at)
         if t_q_std is None:
-            t_q_std = ahead.t_q_std[has_at] = math.sqrt(max(self._t_q_column(p, self._r_tq)[1], 0.0))
+            t_q_std = self._ahead.t_q_std[has_at] = math.sqrt(max(self._t_q_column(p, self._r_tq)[1], 0.0))
         return Forecast(self._t_q_of(x), t_q_std, at_expected, math.sqrt(at_variance))
 
     def drive_for(self, t_q_k: float) -> float:
@@ -282,20 +316,29 @@ class Observer:
 
     def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
         """Propagate the covariance by one sample and return the gains for AT and T_Q (None: missing)."""
-        before = self._P
-        p = self._moved_ahead().p
+        key = (self._P.tobytes(), self._started, r_at, r_tq, complete)
+        step = self._steps.get(key)
+        if step is None:
+            step = self._computed_step(r_at, r_tq, complete)
+            if len(self._steps) >= _KEPT_STEPS:
+                self._steps.clear()
+            self._steps[key] = step
+        self._ahead, gain_at, gain_tq, self._y_var, self._settled = step
+        self._P, self._output_vars = self._ahead.of, None
+        if self._settled:
+            self._steady = self._steady_gains()
+        return gain_at, gain_tq
+
+    def _computed_step(self, r_at: float | None, r_tq: float | None, complete: bool) -> _Step:
+        p = self._moved_ahead()
         gain_at: list[float] = []
         gain_tq: list[float] = []
         if r_at is not None:
             gain_at, p = self._ahead_with_at() if r_at == self._r_at else self._update_at(p, r_at)
         if r_tq is not None:
             gain_tq, p = self._update_t_q(p, r_tq)
-        self._P = p
-        self._y_var, self._output_vars = self._variance_of_y(), None
-        self._settled = complete and self._started and self._has_settled(before)
-        if self._settled:
-            self._steady = self._steady_gains()
-        return gain_at, gain_tq
+        settled = complete and self._started and _has_settled(self._P, p)
+        return _Step(_Ahead(p), gain_at, gain_tq, _variance(self._of_y, p.tolist()), settled)
 
     def _steady_gains(self) -> tuple[list[float], list[float]]:
         """Compute the gains of the steady state, a function of *P* alone so that a restart finds the same."""
@@ -320,18 +363,20 @@ class Observer:
         flat[:: self.size + 1] += self._walk
         return moved
 
-    def _moved_ahead(self) -> _Ahead:
+    def _moved_ahead(self) -> Matrix:
         """Return the covariance one sample ahead, which forecasts and the next sample share."""
         if self._ahead.of is not self._P:
-            self._ahead = _Ahead(of=self._P, p=self._moved_covariance(self._P) if self._started else self._P)
-        return self._ahead
+            self._ahead = _Ahead(self._P)
+        if self._ahead.p is None:
+            self._ahead.p = self._moved_covariance(self._P) if self._started else self._P
+        return self._ahead.p
 
     def _ahead_with_at(self) -> tuple[list[float], Matrix]:
         """Return the gain of an AT that was measured, and the covariance one sample ahead with it."""
-        ahead = self._moved_ahead()
-        if ahead.with_at is None:
-            ahead.with_at = self._update_at(ahead.p, self._r_at)
-        return ahead.with_at
+        p = self._moved_ahead()
+        if self._ahead.with_at is None:
+            self._ahead.with_at = self._update_at(p, self._r_at)
+        return self._ahead.with_at
 
     def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
         column = p[:, self._a]
@@ -362,15 +407,6 @@ class Observer:
             gain = np.zeros(self.size)
             gain[self._q] = 1.0 / self._d[0]
         return gain.tolist(), _corrected(p, gain, column, s)
-
-    def _has_settled(self, before: Matrix) -> bool:
-        variances = self._P.diagonal()
-        deviation = np.sqrt(np.maximum(variances, 0.0))
-        # The variances alone show most of the way that it has not.
-        if (np.abs(variances - before.diagonal()) > SETTLED * (deviation * deviation)).any():
-            return False
-        scale = np.multiply.outer(deviation, deviation)
-        return bool((np.abs(self._P - before) <= SETTLED * scale).all())
 
     def _variance_of_y(self) -> float:
         return _variance(self._of_y, self._P.tolist())
@@ -444,7 +480,7 @@ class Observer:
 
     def covariance_ahead(self) -> Matrix:
         """Return the covariance one sample ahead, before its measurements."""
-        return self._moved_ahead().p
+        return self._moved_ahead()
 
     def widen(self, ahead: Matrix) -> None:
         """Set the covariance after a gap whose inputs were interpolated.
@@ -501,6 +537,16 @@ class Observer:
         self._settled = state.settled
         if state.settled:
             self._steady = self._steady_gains()
+
+
+def _has_settled(before: Matrix, p: Matrix) -> bool:
+    variances = p.diagonal()
+    deviation = np.sqrt(np.maximum(variances, 0.0))
+    # The variances alone show most of the way that it has not.
+    if (np.abs(variances - before.diagonal()) > SETTLED * (deviation * deviation)).any():
+        return False
+    scale = np.multiply.outer(deviation, deviation)
+    return bool((np.abs(p - before) <= SETTLED * scale).all())
 
 
 def _variance(terms: list[tuple[int, float]], covariance: list[list[float]]) -> float:
