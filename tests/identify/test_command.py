@@ -22,6 +22,12 @@ def calibration(tmp_path):
     return write_run(tmp_path / "run.csv", CALIBRATION_W, 1)
 
 
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """The pages of a test that looks at no figure have a stand-in for each; drawing them takes most of the command."""
+    monkeypatch.setattr("compensator.report.page.svg", lambda figure, prefix, width=0.0: f'<svg id="{prefix}"></svg>')
+
+
 def test_model_page_and_summary(tmp_path, calibration, capsys):
     other = write_run(tmp_path / "other.csv", VALIDATION_W, 2)
     out = tmp_path / "out" / "model.toml"
@@ -67,7 +73,7 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
     assert result["model_sha256"] == load_model(out).sha256
 
 
-def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys):
+def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys, without_pictures):
     (tmp_path / "report.html").write_text("a page of another command")
     for name in ("first", "second"):
         assert (
@@ -83,7 +89,7 @@ def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys):
     assert [page["title"] for page in found] == ["Calibration: first", "Calibration: second"]
 
 
-def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys):
+def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys, without_pictures):
     out, page = tmp_path / "model.toml", tmp_path / "p.pdf"
     assert main(["identify", str(calibration), "--out", str(out), "--order", "1", "1", "1", "--page", str(page)]) == 0
     assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'model-calibration.html'}\npage: {page}\n")
