@@ -22,12 +22,6 @@ def calibration(tmp_path):
     return write_run(tmp_path / "run.csv", CALIBRATION_W, 1)
 
 
-@pytest.fixture
-def without_pictures(monkeypatch):
-    """The pages of a test that looks at no figure have a stand-in for each; drawing them takes most of the command."""
-    monkeypatch.setattr("compensator.report.page.svg", lambda figure, prefix, width=0.0: f'<svg id="{prefix}"></svg>')
-
-
 def test_model_page_and_summary(tmp_path, calibration, capsys):
     other = write_run(tmp_path / "other.csv", VALIDATION_W, 2)
     out = tmp_path / "out" / "model.toml"
