@@ -21,7 +21,7 @@ A missing measurement skips its update: the drive keeps its value, the state mov
 covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
 order of summation depends on the processor: the same inputs give the same bits on every machine, which is
 what lets an audit compare bit by bit. Once *P* has settled, its recursion is skipped until a sample is
-missing.
+missing. *P* depends on no measured value, only on which are missing: observers of one design share its steps.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
 """
@@ -42,8 +42,9 @@ from compensator.model.transfer_function import SampledTransferFunction
 #: P counts as settled when no element moves by more than this, relative to its standard deviations.
 SETTLED = 1e-7
 
-#: So many steps of the covariance are kept for each of so many designs: it is the same in every run from rest.
-_KEPT_STEPS, _KEPT_DESIGNS = 4096, 4
+#: So many steps of the covariance are kept for each of so many designs: it is the same in every run from rest. About
+#: 1,000 lead to the steady state, as many after a gap; one takes 3 to 7 kB.
+_KEPT_STEPS, _KEPT_DESIGNS = 2048, 4
 
 _UNITY = SampledTransferFunction(b=(1.0,), a=(1.0,), period_s=60.0)
 _ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
