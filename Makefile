@@ -13,7 +13,11 @@ $(VENV)/.ready: requirements.txt pyproject.toml
 demo: $(VENV)/.ready
 	$(BIN)/compensator demo --out demo-out
 
+# Or every process of a test run would compile the sources anew.
+test check: export PYTHONDONTWRITEBYTECODE =
+
 test: $(VENV)/.ready
+	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.ready
@@ -21,6 +25,7 @@ check: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 soak: $(VENV)/.ready

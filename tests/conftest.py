@@ -36,3 +36,12 @@ def _no_handler_is_left() -> Iterator[None]:
     yield
     root.handlers[:] = [handler for handler in root.handlers if handler in before]
     root.setLevel(level)
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give the pages of a test a stand-in for each figure: drawing them takes longer than what most tests look at.
+
+    For tests of figures and words that other tests have drawn: `report/` draws the page of every command.
+    """
+    monkeypatch.setattr("compensator.report.page.svg", lambda figure, prefix, width=0.0: f'<svg id="{prefix}"></svg>')

@@ -89,8 +89,32 @@ def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]
         ]
 
 
-def held_out_errors(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Vector]:
-    """Return the free-run errors on each fold of the fit to the other folds."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tried:
+    """A structure fitted to everything and, fold by fold, to the rest.
+
+    Parameters
+    ----------
+    structure : Structure
+        Orders.
+    whole : OutputErrorFit
+        The fit to everything.
+    errors : tuple of numpy.ndarray
+        Free-run errors on each fold of the fit to the other folds.
+    """
+
+    structure: Structure
+    whole: OutputErrorFit
+    errors: tuple[Vector, ...]
+
+    @property
+    def fold_rms(self) -> tuple[float, ...]:
+        """Root mean square of the errors on each fold."""
+        return tuple(float(np.sqrt(np.mean(e**2))) for e in self.errors)
+
+
+def tried(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Tried:
+    """Fit a structure to everything, and to all but one fold after another."""
     whole = fit(segments, structure, period_s)
     errors = []
     for part in folds_of(segments, folds):
@@ -99,7 +123,7 @@ def held_out_errors(segments: Sequence[Segment], structure: Structure, period_s:
         residuals = fit(part, structure, period_s, warm=whole.taus_min.tolist()).residuals
         held_out = [s.used & ~p.used for s, p in zip(segments, part, strict=True)]
         errors.append(np.concatenate([r[h] for r, h in zip(residuals, held_out, strict=True)]))
-    return [e for e in errors if e.size]
+    return Tried(structure=structure, whole=whole, errors=tuple(e for e in errors if e.size))
 
 
 def choose(
@@ -108,8 +132,9 @@ def choose(
     *,
     period_s: float,
     folds: int,
+    known: Tried | None = None,
     progress: Progress = unreported,
-) -> list[Candidate]:
+) -> tuple[list[Candidate], OutputErrorFit]:
     """Evaluate structures on folds and mark the chosen one.
 
     Parameters
@@ -122,6 +147,8 @@ def choose(
         Sample period, s.
     folds : int
         Number of blocks.
+    known : Tried, optional
+        A structure that was tried on these data before.
     progress : callable
         Called with the number of structures done and their total.
 
@@ -129,6 +156,8 @@ def choose(
     -------
     list of Candidate
         In the order given, one of them chosen.
+    OutputErrorFit
+        Its fit to everything.
 
     Raises
     ------
@@ -136,12 +165,16 @@ def choose(
         If the data is too short for every candidate.
     """
     candidates: list[Candidate] = []
+    fits: dict[Structure, OutputErrorFit] = {}
     for done, structure in enumerate(structures):
         progress(done, len(structures))
         try:
-            candidates.append(_candidate(segments, structure, period_s, folds))
+            is_known = known is not None and known.structure == structure
+            found = known if known is not None and is_known else tried(segments, structure, period_s, folds)
         except DataError:
             continue
+        candidates.append(_candidate(segments, found))
+        fits[structure] = found.whole
     if not candidates:
         raise DataError(f"too little data for the smallest structure ({structures[0]})")
     prior = structures[0].prior
@@ -149,13 +182,13 @@ def choose(
         candidates = _with_information(candidates, sum(int(s.used.sum()) for s in segments), prior.noise)
     among = [c for c in candidates if c.supported] or candidates
     if prior is not None:
-        least = min(among, key=lambda c: c.information)
-        return [dataclasses.replace(c, chosen=c is least) for c in candidates]
-    best = min(among, key=lambda c: c.rms)
-    simplest = min(
-        (c for c in among if no_worse(c.fold_rms, best.fold_rms)), key=lambda c: (c.structure.parameters, c.rms)
-    )
-    return [dataclasses.replace(c, chosen=c is simplest) for c in candidates]
+        winner = min(among, key=lambda c: c.information)
+    else:
+        best = min(among, key=lambda c: c.rms)
+        winner = min(
+            (c for c in among if no_worse(c.fold_rms, best.fold_rms)), key=lambda c: (c.structure.parameters, c.rms)
+        )
+    return [dataclasses.replace(c, chosen=c is winner) for c in candidates], fits[winner.structure]
 
 
 def _with_information(candidates: Sequence[Candidate], count: int, noise: float) -> list[Candidate]:
@@ -170,13 +203,12 @@ def _with_information(candidates: Sequence[Candidate], count: int, noise: float)
     ]
 
 
-def _candidate(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Candidate:
-    whole = fit(segments, structure, period_s)
-    errors = held_out_errors(segments, structure, period_s, folds)
+def _candidate(segments: Sequence[Segment], found: Tried) -> Candidate:
+    structure, whole = found.structure, found.whole
     return Candidate(
         structure=structure,
-        rms=float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
-        fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in errors),
+        rms=float(np.sqrt(np.mean(np.concatenate(found.errors) ** 2))),
+        fold_rms=found.fold_rms,
         supported=whole.rank_deficit == 0,
         squares=float(sum(np.sum(r[s.used] ** 2) for r, s in zip(whole.residuals, segments, strict=True))),
         parameters=structure.parameters + sum(own.size for own in whole.nuisances),

@@ -19,7 +19,7 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
 from compensator.errors import DataError
-from compensator.identify.choice import Candidate, choose, fit
+from compensator.identify.choice import Candidate, choose
 from compensator.identify.output_error import OutputErrorFit, Prior, Segment, Structure
 from compensator.identify.rest import settle_starts
 from compensator.identify.settings import Settings
@@ -208,10 +208,11 @@ def _chosen(
 ) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
     """Determine how the runs start, choose a structure on the held-out blocks and fit it to all data."""
     largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
-    segments = settle_starts(data, largest, period_s, settings.folds)
-    candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, progress=progress)
-    winner = next(c for c in candidates if c.chosen).structure
-    return segments, candidates, fit(segments, winner, period_s)
+    segments, known = settle_starts(data, largest, period_s, settings.folds)
+    candidates, result = choose(
+        segments, structures, period_s=period_s, folds=settings.folds, known=known, progress=progress
+    )
+    return segments, candidates, result
 
 
 def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import numpy as np
-
-from compensator.identify.choice import held_out_errors, no_worse
+from compensator.identify.choice import Tried, no_worse, tried
 from compensator.identify.output_error import Segment, Structure
 
 
-def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Segment]:
+def settle_starts(
+    segments: Sequence[Segment], structure: Structure, period_s: float, folds: int
+) -> tuple[list[Segment], Tried]:
     """Mark the segments whose start from rest the data do not contradict.
 
     Segment by segment, a start from rest is kept if it increases the free-run error on held-out blocks over that of a
@@ -33,16 +33,14 @@ def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: f
     -------
     list of Segment
         The same data, with `rest` set for these segments.
+    Tried
+        The structure on them.
     """
-
-    def errors(trial: Sequence[Segment]) -> list[float]:
-        return [float(np.sqrt(np.mean(e**2))) for e in held_out_errors(trial, structure, period_s, folds)]
-
     kept = [dataclasses.replace(segment, rest=False) for segment in segments]
-    free = errors(kept)
+    free = tried(kept, structure, period_s, folds)
     for i, segment in enumerate(kept):
         trial = [*kept[:i], dataclasses.replace(segment, rest=True), *kept[i + 1 :]]
-        fixed = errors(trial)
-        if no_worse(fixed, free):
+        fixed = tried(trial, structure, period_s, folds)
+        if no_worse(fixed.fold_rms, free.fold_rms):
             kept, free = trial, fixed
-    return kept
+    return kept, free

@@ -10,7 +10,6 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
 from compensator.errors import DataError, ModelError
-from compensator.identify.choice import fit, held_out_errors
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure
 from compensator.identify.rest import settle_starts
 from compensator.model.thermal_model import check_inverse
@@ -91,15 +90,15 @@ def fit_temperature(
     remark = ""
     for nb in range(terms, 0, -1):
         structure = Structure(order=order, terms=(nb,))
-        segments = settle_starts(free, structure, period_s, folds)
-        result = fit(segments, structure, period_s)
+        segments, found = settle_starts(free, structure, period_s, folds)
+        result = found.whole
         function = result.function()
         try:
             check_inverse("the TTF", function)
         except ModelError as error:
             remark = f"TTF with nb {terms}: {error}; fitted with nb {nb - 1} instead"
             continue
-        errors = np.concatenate(held_out_errors(segments, structure, period_s, folds))
+        errors = np.concatenate(found.errors)
         return TemperatureFit(
             fit=result,
             segments=tuple(segments),

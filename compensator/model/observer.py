@@ -21,7 +21,7 @@ A missing measurement skips its update: the drive keeps its value, the state mov
 covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
 order of summation depends on the processor: the same inputs give the same bits on every machine, which is
 what lets an audit compare bit by bit. Once *P* has settled, its recursion is skipped until a sample is
-missing.
+missing. *P* depends on no measured value, only on which are missing: observers of one design share its steps.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
 """
@@ -29,7 +29,9 @@ Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential upd
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +41,10 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 #: P counts as settled when no element moves by more than this, relative to its standard deviations.
 SETTLED = 1e-7
+
+#: So many steps of the covariance are kept for each of so many designs: it is the same in every run from rest. About
+#: 1,000 lead to the steady state, as many after a gap; one takes 3 to 7 kB.
+_KEPT_STEPS, _KEPT_DESIGNS = 2048, 4
 
 _UNITY = SampledTransferFunction(b=(1.0,), a=(1.0,), period_s=60.0)
 _ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
@@ -82,6 +88,56 @@ class Forecast:
     t_q_std_k: float
     at_k: float
     at_std_k: float
+
+
+@dataclass(slots=True)
+class _Ahead:
+    """What follows from a covariance alone, as far as it has been asked for.
+
+    Parameters
+    ----------
+    of : numpy.ndarray, shape (n, n)
+        The covariance after a sample; never changed once it is set.
+    p : numpy.ndarray, shape (n, n), optional
+        That of one sample later, before its measurements.
+    with_at : tuple of list of float and numpy.ndarray, optional
+        Gain of an AT that is measured then, and the covariance with it.
+    t_q_std : dict of bool to float
+        Standard deviation of what T_Q will measure, K, with AT measured and without.
+    """
+
+    of: Matrix
+    p: Matrix | None = None
+    with_at: tuple[list[float], Matrix] | None = None
+    t_q_std: dict[bool, float] = field(default_factory=dict)
+
+
+class _Step(NamedTuple):
+    """A step of the covariance, which depends on no measured value: shared by all observers of the same design.
+
+    Parameters
+    ----------
+    ahead : _Ahead
+        Covariance after the sample, and what follows from it.
+    gain_at, gain_tq : list of float
+        Gains for AT and T_Q; empty where missing.
+    y_var : float
+        Variance of y, µm².
+    settled : bool
+        Whether the covariance has reached its steady value.
+    """
+
+    ahead: _Ahead
+    gain_at: list[float]
+    gain_tq: list[float]
+    y_var: float
+    settled: bool
+
+
+@lru_cache(maxsize=_KEPT_DESIGNS)
+def _steps_of(design: tuple[object, ...]) -> dict[tuple[object, ...], _Step]:
+    """Return the steps that observers of a design have made."""
+    return {}
 
 
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
@@ -128,6 +184,8 @@ class Observer:
         #: States of y and their weights.
         weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
         self._of_y = [(index, weight) for index, weight in weights if index < self.size]
+        noise = (self._kalman, self._r_tq, self._r_at, *self._walk.tolist())
+        self._steps = _steps_of((noise, tuple(self._rows), tuple(self._first), tuple(self._d), tuple(self._of_y)))
         self.reset()
 
     def _lay_out(self, *functions: SampledTransferFunction) -> None:
@@ -151,8 +209,9 @@ class Observer:
         rows += [(self._q, nil, nil, 0.0, 0.0), (self._a, nil, nil, 0.0, 0.0)]
         self._rows = rows
         next_row, first_row, source_row, a_column, b_column = (np.array(column) for column in zip(*rows, strict=True))
-        self._next_row, self._first_row, self._source_row = next_row, first_row, source_row
-        self._a_column, self._b_column = a_column[:, None], b_column[:, None]
+        self._gathered = np.array((next_row, first_row, source_row))
+        self._factors = np.array((a_column, b_column))[:, :, None]
+        self._padded: Matrix = np.zeros((self.size + 1, self.size))
 
     def _paths_of(self, part: int) -> tuple[int, int]:
         """Return the numbers of DTF and TDTF of a part of the model; 0 is the first."""
@@ -176,6 +235,7 @@ class Observer:
         """Return to rest: every state zero and known."""
         self._x = [0.0] * (self.size + 1)
         self._P: Matrix = np.zeros((self.size, self.size))
+        self._ahead = _Ahead(self._P)
         self._settled = False
         self._started = False
         self._steady: tuple[list[float], list[float]] = ([], [])
@@ -237,13 +297,17 @@ class Observer:
             AT of that sample as a change from its reference, K, from which T_Q is then expected; NaN where missing.
         """
         x = self._moved(self._x) if self._started else self._x
-        p = self._moved_covariance(self._P) if self._started else self._P
+        p, has_at = self._moved_ahead(), not math.isnan(at_k)
         at_expected, at_variance = x[self._a], float(p[self._a, self._a]) + self._r_at
-        if not math.isnan(at_k):
-            gain, p = self._update_at(p, self._r_at)
-            x = [*(value + k * (at_k - at_expected) for value, k in zip(x, gain, strict=False)), 0.0]
-        _, t_q_variance = self._t_q_column(p, self._r_tq)
-        return Forecast(self._t_q_of(x), math.sqrt(max(t_q_variance, 0.0)), at_expected, math.sqrt(at_variance))
+        if has_at:
+            gain, p = self._ahead_with_at()
+            innovation = at_k - at_expected
+            x = [value + k * innovation for value, k in zip(x, gain, strict=False)]
+            x.append(0.0)
+        t_q_std = self._ahead.t_q_std.get(has_at)
+        if t_q_std is None:
+            t_q_std = self._ahead.t_q_std[has_at] = math.sqrt(max(self._t_q_column(p, self._r_tq)[1], 0.0))
+        return Forecast(self._t_q_of(x), t_q_std, at_expected, math.sqrt(at_variance))
 
     def drive_for(self, t_q_k: float) -> float:
         """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
@@ -253,20 +317,29 @@ class Observer:
 
     def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
         """Propagate the covariance by one sample and return the gains for AT and T_Q (None: missing)."""
-        before = self._P
-        p = self._moved_covariance(before) if self._started else before
-        gain_at: list[float] = []
-        gain_tq: list[float] = []
-        if r_at is not None:
-            gain_at, p = self._update_at(p, r_at)
-        if r_tq is not None:
-            gain_tq, p = self._update_t_q(p, r_tq)
-        self._P = p
-        self._y_var, self._output_vars = self._variance_of_y(), None
-        self._settled = complete and self._started and self._has_settled(before)
+        key = (self._P.tobytes(), self._started, r_at, r_tq, complete)
+        step = self._steps.get(key)
+        if step is None:
+            step = self._computed_step(r_at, r_tq, complete)
+            if len(self._steps) >= _KEPT_STEPS:
+                self._steps.clear()
+            self._steps[key] = step
+        self._ahead, gain_at, gain_tq, self._y_var, self._settled = step
+        self._P, self._output_vars = self._ahead.of, None
         if self._settled:
             self._steady = self._steady_gains()
         return gain_at, gain_tq
+
+    def _computed_step(self, r_at: float | None, r_tq: float | None, complete: bool) -> _Step:
+        p = self._moved_ahead()
+        gain_at: list[float] = []
+        gain_tq: list[float] = []
+        if r_at is not None:
+            gain_at, p = self._ahead_with_at() if r_at == self._r_at else self._update_at(p, r_at)
+        if r_tq is not None:
+            gain_tq, p = self._update_t_q(p, r_tq)
+        settled = complete and self._started and _has_settled(self._P, p)
+        return _Step(_Ahead(p), gain_at, gain_tq, _variance(self._of_y, p.tolist()), settled)
 
     def _steady_gains(self) -> tuple[list[float], list[float]]:
         """Compute the gains of the steady state, a function of *P* alone so that a restart finds the same."""
@@ -275,19 +348,36 @@ class Observer:
         return gain_at, gain_tq
 
     def _f_times(self, matrix: Matrix) -> Matrix:
-        rows = np.zeros((self.size + 1, self.size))
-        rows[:-1] = matrix
-        following, first, source = (rows.take(of, axis=0) for of in (self._next_row, self._first_row, self._source_row))
-        product: Matrix = following - self._a_column * first + self._b_column * source
+        self._padded[:-1] = matrix
+        rows = self._padded.take(self._gathered, axis=0)
+        rows[1:] *= self._factors
+        product: Matrix = rows[0]
+        product -= rows[1]
+        product += rows[2]
         return product
 
     def _moved_covariance(self, p: Matrix) -> Matrix:
         moved = self._f_times(self._f_times(p).T)
         # Symmetric to the bit, because a snapshot keeps the upper triangle only.
         flat = moved.reshape(-1)
-        flat[self._lower] = flat[self._upper]
+        flat.put(self._lower, flat.take(self._upper))
         flat[:: self.size + 1] += self._walk
         return moved
+
+    def _moved_ahead(self) -> Matrix:
+        """Return the covariance one sample ahead, which forecasts and the next sample share."""
+        if self._ahead.of is not self._P:
+            self._ahead = _Ahead(self._P)
+        if self._ahead.p is None:
+            self._ahead.p = self._moved_covariance(self._P) if self._started else self._P
+        return self._ahead.p
+
+    def _ahead_with_at(self) -> tuple[list[float], Matrix]:
+        """Return the gain of an AT that was measured, and the covariance one sample ahead with it."""
+        p = self._moved_ahead()
+        if self._ahead.with_at is None:
+            self._ahead.with_at = self._update_at(p, self._r_at)
+        return self._ahead.with_at
 
     def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
         column = p[:, self._a]
@@ -318,14 +408,6 @@ class Observer:
             gain = np.zeros(self.size)
             gain[self._q] = 1.0 / self._d[0]
         return gain.tolist(), _corrected(p, gain, column, s)
-
-    def _has_settled(self, before: Matrix) -> bool:
-        deviation = np.sqrt(np.maximum(self._P.diagonal(), 0.0))
-        # The variances alone show most of the way that it has not.
-        if np.any(np.abs(self._P.diagonal() - before.diagonal()) > SETTLED * (deviation * deviation)):
-            return False
-        scale = np.multiply.outer(deviation, deviation)
-        return bool(np.all(np.abs(self._P - before) <= SETTLED * scale))
 
     def _variance_of_y(self) -> float:
         return _variance(self._of_y, self._P.tolist())
@@ -399,7 +481,7 @@ class Observer:
 
     def covariance_ahead(self) -> Matrix:
         """Return the covariance one sample ahead, before its measurements."""
-        return self._moved_covariance(self._P) if self._started else self._P
+        return self._moved_ahead()
 
     def widen(self, ahead: Matrix) -> None:
         """Set the covariance after a gap whose inputs were interpolated.
@@ -456,6 +538,16 @@ class Observer:
         self._settled = state.settled
         if state.settled:
             self._steady = self._steady_gains()
+
+
+def _has_settled(before: Matrix, p: Matrix) -> bool:
+    variances = p.diagonal()
+    deviation = np.sqrt(np.maximum(variances, 0.0))
+    # The variances alone show most of the way that it has not.
+    if (np.abs(variances - before.diagonal()) > SETTLED * (deviation * deviation)).any():
+        return False
+    scale = np.multiply.outer(deviation, deviation)
+    return bool((np.abs(p - before) <= SETTLED * scale).all())
 
 
 def _variance(terms: list[tuple[int, float]], covariance: list[list[float]]) -> float:

@@ -17,6 +17,9 @@ from tests.api.tables import write_run
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import CALIBRATION_W
 
+#: The figure is a number in words here; no picture is looked at.
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -160,7 +160,7 @@ def test_three_probes_that_move_alike_show_no_pair():
     assert (pair.first, pair.second) == ("p1", "p2"), "the slope of an axis is no probe"
 
 
-def test_the_lines_of_a_tilt_are_a_configuration_once_they_are_filled_in(tmp_path):
+def test_the_lines_of_a_tilt_are_a_configuration_once_they_are_filled_in(tmp_path, without_pictures):
     table = machine(axes=("y",))
     low = table.pop("y_um")
     found = tc.identify(table | {"p1_um": low, "p2_um": 1.5 * low + 2.0}, axis=["p1", "p2"], order=(1, 1, 1))

@@ -67,7 +67,7 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
     assert result["model_sha256"] == load_model(out).sha256
 
 
-def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys):
+def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys, without_pictures):
     (tmp_path / "report.html").write_text("a page of another command")
     for name in ("first", "second"):
         assert (
@@ -83,7 +83,7 @@ def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys):
     assert [page["title"] for page in found] == ["Calibration: first", "Calibration: second"]
 
 
-def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys):
+def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys, without_pictures):
     out, page = tmp_path / "model.toml", tmp_path / "p.pdf"
     assert main(["identify", str(calibration), "--out", str(out), "--order", "1", "1", "1", "--page", str(page)]) == 0
     assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'model-calibration.html'}\npage: {page}\n")

@@ -132,8 +132,8 @@ def test_rest_is_kept_where_true_and_given_up_where_not():
     heat, ambient, _, y, _, _ = published(CALIBRATION_W, 6)
     cold = [Segment.of([heat, ambient], y)]
     warm = [Segment.of([heat[420:], ambient[420:]], y[420:])]
-    assert settle_starts(cold, TRUE, 60.0, 5)[0].rest
-    assert not settle_starts(warm, TRUE, 60.0, 5)[0].rest
+    assert settle_starts(cold, TRUE, 60.0, 5)[0][0].rest
+    assert not settle_starts(warm, TRUE, 60.0, 5)[0][0].rest
 
 
 def test_accuracy_on_the_published_case():

@@ -67,6 +67,10 @@ class FaultFit:
     share: float = 0.0
 
 
+#: Number of a block, its whitened value times its weight, and the weight.
+_Whitened = tuple[int, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class _Shape:
     suspect: str
@@ -104,32 +108,28 @@ class FaultIsolation:
             The newest last.
         """
         z = [block.residual_um / block.std_um for block in blocks]
-        candidates = [self._starting_at(begin, blocks, z) for begin in range(len(blocks) - 1)]
-        best: dict[str, FaultFit] = {}
-        for fit in [fit for each in candidates for fit in each] + [self._as_prediction(blocks, z)]:
-            if fit.suspect not in best or fit.gain > best[fit.suspect].gain:
-                best[fit.suspect] = fit
-        ranked = sorted(best.values(), key=lambda fit: (-fit.gain, fit.suspect))
+        whitened = _whitened(z, self._keep)
+        best: dict[str, tuple[float, float, _Shape, int]] = {}
+        for begin in range(len(blocks) - 1):
+            for shape in self._shapes:
+                v = [value / block.std_um for value, block in zip(shape.values, blocks[begin:], strict=False)]
+                size, gain = _fitted(whitened, v, begin, self._keep)
+                if shape.suspect not in best or gain > best[shape.suspect][0]:
+                    best[shape.suspect] = gain, size, shape, begin
+        fits = [
+            FaultFit(shape.suspect, f"{shape.what} by {size:+.2g} {shape.unit}", len(blocks) - begin, gain)
+            for gain, size, shape, begin in best.values()
+        ]
+        ranked = sorted([*fits, self._as_prediction(blocks, whitened)], key=lambda fit: (-fit.gain, fit.suspect))
         energy, count = _energy(z, self._keep)
         if energy > 0.0:
             ranked = [dataclasses.replace(fit, share=fit.gain / energy) for fit in ranked]
         left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
         return ranked, count > 0 and left > MISFIT * count
 
-    def _starting_at(self, begin: int, blocks: Sequence[ResidualBlock], z: Sequence[float]) -> list[FaultFit]:
-        fits = []
-        for shape in self._shapes:
-            v = [0.0] * begin + [
-                value / block.std_um for value, block in zip(shape.values, blocks[begin:], strict=False)
-            ]
-            size, gain = _fitted(z, v, self._keep)
-            words = f"{shape.what} by {size:+.2g} {shape.unit}"
-            fits.append(FaultFit(shape.suspect, words, len(blocks) - begin, gain))
-        return fits
-
-    def _as_prediction(self, blocks: Sequence[ResidualBlock], z: Sequence[float]) -> FaultFit:
+    def _as_prediction(self, blocks: Sequence[ResidualBlock], whitened: Sequence[_Whitened]) -> FaultFit:
         v = [block.predicted_um / block.std_um for block in blocks]
-        size, gain = _fitted(z, v, self._keep)
+        size, gain = _fitted(whitened, v, 0, self._keep)
         words = f"measured Y is {1.0 + size:.2f} times the prediction"
         return FaultFit("model", words, len(blocks), gain)
 
@@ -163,19 +163,28 @@ class FaultIsolation:
         return tuple(values)
 
 
-def _fitted(z: Sequence[float], v: Sequence[float], keep: float) -> tuple[float, float]:
-    """Return size and log likelihood gain of a shape, both whitened; missing blocks are left out."""
-    cross = square = 0.0
-    z_before = v_before = math.nan
-    for zi, vi in zip(z, v, strict=True):
-        if math.isnan(zi) or math.isnan(vi):
+def _whitened(z: Sequence[float], keep: float) -> list[_Whitened]:
+    """Return the values that are not missing, whitened: the number of each, its value times its weight, its weight."""
+    found: list[_Whitened] = []
+    weight, before = 1.0, 0.0
+    for i, zi in enumerate(z):
+        if not math.isnan(zi):
+            found.append((i, weight * (zi - keep * before), weight))
+            weight, before = 1.0 / (1.0 - keep * keep), zi
+    return found
+
+
+def _fitted(z: Sequence[_Whitened], v: Sequence[float], begin: int, keep: float) -> tuple[float, float]:
+    """Return size and log likelihood gain of a shape that is zero before a block; missing blocks are left out."""
+    cross = square = v_before = 0.0
+    for i, weighted, weight in z:
+        if i < begin:
             continue
-        first = math.isnan(z_before)
-        ez, ev = (zi, vi) if first else (zi - keep * z_before, vi - keep * v_before)
-        weight = 1.0 if first else 1.0 / (1.0 - keep * keep)
-        cross += weight * ez * ev
+        vi = v[i - begin]
+        ev = vi - keep * v_before
+        cross += weighted * ev
         square += weight * ev * ev
-        z_before, v_before = zi, vi
+        v_before = vi
     if not square > 0.0:
         return 0.0, 0.0
     return cross / square, 0.5 * cross * cross / square

@@ -96,15 +96,21 @@ def evidence(residual_um: Vector, difference_um: Vector) -> Evidence:
     if n < 3:
         return Evidence(0.0, float(n))
     for _ in range(_ITERATIONS):
-        moves = difference_um - np.average(difference_um, weights=weights)
+        total = weights.sum()
+        moves = difference_um - (difference_um * weights).sum() / total
         square = float(np.sum(weights * moves**2))
         if not square > 0.0:
             return Evidence(0.0, float(n))
         beta = float(np.sum(weights * moves * residual_um)) / square
         left = residual_um - beta * moves
-        left = left - np.average(left, weights=weights)
-        scale = max(_MEDIAN_TO_STD * float(np.median(np.abs(left))), FLOOR_UM)
-        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(left), scale))
+        left = left - (left * weights).sum() / total
+        sizes = np.abs(left)
+        ordered = np.sort(sizes)
+        median = 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
+        scale = max(_MEDIAN_TO_STD * median, FLOOR_UM)
+        before, weights = weights, np.minimum(1.0, _HUBER * scale / np.maximum(sizes, scale))
+        if np.array_equal(before, weights):
+            break  # what follows would be the same
     clipped = weights * left
     variance = max(float(np.sum(clipped**2)) / (n - 2), FLOOR_UM**2)
     effective = n * _independent(clipped * moves)
