@@ -172,14 +172,13 @@ class JumpEngines:
 
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
-        if is_unsteady(state) and state.is_suspect:
+        if is_unsteady(state):
+            # The shifted engine goes without the channel: this would compare what they know, not whether it is right.
             return
-        # Of a loose contact that is used again the shifted engine knows nothing: only the other channel compares them.
-        skipped = state.shifts_k if is_unsteady(state) else ()
         cost = 0.0
         for run, values, sign in ((self.believing, offered, -0.5), (self.shifted, fed.values, 0.5)):
             for name in TEMPERATURES:
-                if name in fed.jumped or name in skipped or math.isnan(values[name]):
+                if name in fed.jumped or math.isnan(values[name]):
                     continue
                 expected, std = expected_value(run.engine, name, values["at_degc"])
                 cost += sign * min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP)

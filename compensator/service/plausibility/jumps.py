@@ -425,9 +425,9 @@ class JumpWatch:
             by = self._confirmed_by()
             if by:
                 return self._accept(engine, offered, None, f"is confirmed: {by} with it")
-            # Of a loose contact the shifted engine is no hypothesis: where it fits better, it does by chance.
+            # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
             against = state.y_against >= Y_SAMPLES or state.probes_against >= _PROBES
-            is_refuted = not is_unsteady(state) and (is_refuted or against)
+            is_refuted |= against and not is_unsteady(state)
         if is_refuted:
             engine.restore(shifted.engine.snapshot())
             estimate = shifted.estimate
