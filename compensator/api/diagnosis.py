@@ -372,6 +372,8 @@ def _diagnosed(
     screen_temperatures(name, runs, quiet_air=True)
     require_y_noise(name, runs)
     check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
+    for one in validation:  # refused before the search, which may take minutes
+        FreeRunErrors.of({BASE: base}, [one], HELD_OUT)
     found = find_effects(base, runs, expected=expected, progress=progress, executor_map=executor_map)
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}

@@ -129,6 +129,8 @@ def identify(
         etve_end_h=float(etve_end_h),
         folds=folds,
     )
+    # A wrong file is refused before the fit, which may take minutes.
+    other = {} if reference is None else models_of(reference)
     sources = {
         role: measurements(given, name, columns, needed=role == "fit")
         for role, name, given in (("fit", "data", data), ("etve", "etve", etve), ("validation", "validate", validate))
@@ -157,7 +159,7 @@ def identify(
     calibrations = of_machine({one: calibrations[one] for one in axes})
     alone = calibrations
     calibrations, shared = calibrated_together(alone, progress=progress)
-    results = _results(calibrations, sources, words, fit_until_h, reference)
+    results = _results(calibrations, sources, words, fit_until_h, other)
     if len(results) == 1:
         return next(iter(results.values()))
     alone_um = {one: calibration.folds_rms_um for one, calibration in alone.items()}
@@ -211,7 +213,7 @@ def _results(
     sources: Mapping[str, Sequence[Measurement]],
     words: Mapping[str, AxisWords],
     fit_until_h: float | None,
-    reference: ModelLike | None,
+    other: Mapping[str, ThermalModel],
 ) -> dict[str, IdentificationResult]:
     """Return the result of each axis, with the models as one file has them."""
     views, free_runs, models = {}, {}, {}
@@ -224,7 +226,6 @@ def _results(
         provenance = dict(calibration.model.provenance) | {key: found[key] for key in _KEPT if key in found}
         models[axis] = dataclasses.replace(calibration.model, provenance=provenance)
     models = axes_as_in_file(models)
-    other = {} if reference is None else models_of(reference)
     return {
         axis: IdentificationResult(
             model=models[axis],

@@ -60,6 +60,7 @@ class Fault(Enum):
         AuditFinding.DAMAGED,
         "byte {offset}: the length of a record exceeds the file, but its content is complete",
     )
+    NO_RECORDING = AuditFinding.DAMAGED, "not read: {what}"
     CUT_OFF = AuditFinding.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
     INDEX = AuditFinding.INDEX, "{what}"
     # Several files.

@@ -28,6 +28,8 @@ class RecordingAudit:
         Value of the hash chain from which it continues, and its last value; empty if it has no chain.
     end : RecordingEnd or AuditFinding
         How it ends: with or without an end, or truncated or damaged.
+    is_recording : bool
+        Whether it could be opened and is a recording of the service; if not, it has no place in the series.
     findings, findings_count : list of Finding, int
         The first findings, and the number of all findings.
     records : int
@@ -78,6 +80,7 @@ class RecordingAudit:
     previous: str = ""
     last: str = ""
     end: RecordingEnd | AuditFinding = RecordingEnd.FINISHED
+    is_recording: bool = True
     findings: list[Finding] = field(default_factory=list)
     findings_count: int = 0
     records: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
@@ -14,7 +15,7 @@ from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
 from compensator.audit.verdict import partly, verdict
 from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
-from compensator.errors import UsageError
+from compensator.errors import DataError, UsageError
 from compensator.recording.chain import NOTHING
 from compensator.recording.head import read_head
 from compensator.recording.signature import Verifier
@@ -124,6 +125,9 @@ def audit(
 ) -> Audit:
     """Audit recordings.
 
+    What lies among recordings and is no file, such as a pipe, is a finding: it may stand where a recording was, and the
+    others can still be audited.
+
     Parameters
     ----------
     paths : sequence of pathlib.Path
@@ -140,7 +144,7 @@ def audit(
     Raises
     ------
     DataError
-        If a file is not a recording.
+        If a file is not a recording, or there is none but what is no file.
     UsageError
         If the key or the head cannot be used.
     """
@@ -163,10 +167,12 @@ def audit(
     if executor is not None:
         audits = _side_by_side(executor, paths, public_key, heads, lambda path: add(sizes[path]))
     else:
-        audits = [
-            audit_recording(path, verifier, heads=heads.get(path.name, frozenset()), progress=add) for path in paths
-        ]
-    return combine(audits, signed=verifier is not None, newest=list(ends)[-1] if ends else "", heads=heads)
+        audits = [_audited(path, verifier, heads.get(path.name, frozenset()), progress=add) for path in paths]
+    whole = [_or_finding(path, one) for path, one in zip(paths, audits, strict=True)]
+    for one in audits:
+        if isinstance(one, DataError) and not any(file.is_recording for file in whole):
+            raise one
+    return combine(whole, signed=verifier is not None, newest=list(ends)[-1] if ends else "", heads=heads)
 
 
 def _side_by_side(
@@ -175,7 +181,7 @@ def _side_by_side(
     public_key: Path | None,
     heads: Mapping[str, frozenset[str]],
     done: Callable[[Path], None],
-) -> list[RecordingAudit]:
+) -> list[RecordingAudit | DataError]:
     """Audit files in parallel: each contains the state at its start, so they are independent."""
     jobs = {executor.submit(_audit_one, path, public_key, heads.get(path.name, frozenset())): path for path in paths}
     for job in as_completed(jobs):
@@ -184,8 +190,36 @@ def _side_by_side(
     return [job.result() for job in jobs]
 
 
-def _audit_one(path: Path, public_key: Path | None, heads: frozenset[str]) -> RecordingAudit:
-    return audit_recording(path, Verifier(public_key) if public_key else None, heads=heads)
+def _audit_one(path: Path, public_key: Path | None, heads: frozenset[str]) -> RecordingAudit | DataError:
+    return _audited(path, Verifier(public_key) if public_key else None, heads)
+
+
+def _audited(
+    path: Path, verifier: Verifier | None, heads: frozenset[str], progress: Callable[[int], None] | None = None
+) -> RecordingAudit | DataError:
+    """Return the audit of a file, or why it is no recording."""
+    try:
+        return audit_recording(path, verifier, heads=heads, progress=progress)
+    except DataError as error:
+        return error
+
+
+def _or_finding(path: Path, found: RecordingAudit | DataError) -> RecordingAudit:
+    """Return the audit of a file; of a folder, link without a file, pipe or device one with that as its finding.
+
+    Raises
+    ------
+    DataError
+        If there is nothing, or a file that no service wrote: this is a mistake, no evidence.
+    """
+    if isinstance(found, RecordingAudit):
+        return found
+    if path.is_file() or not os.path.lexists(path):
+        raise found
+    words = str(found).removeprefix(f"{path}: ")
+    entry = RecordingAudit(file=path.name, original=path.name, end=AuditFinding.DAMAGED, is_recording=False)
+    entry.find(Fault.NO_RECORDING, what=words)
+    return entry
 
 
 def combine(
@@ -207,11 +241,12 @@ def combine(
     # By the names at their creation, which show the order even if the clock was set back.
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
     series = _Series(files, signed, newest)
-    for before, after in zip([None, *files[:-1]], files, strict=True):
+    read = [file for file in files if file.is_recording]
+    for before, after in zip([None, *read[:-1]], read, strict=True):
         series.check_file(after)
         series.check_link(before if before is not None and before.machine == after.machine else None, after)
-    if files and newest:
-        series.check_head(files, newest, heads)
+    if read and newest:
+        series.check_head(read, newest, heads)
     if not any(file.samples or file.last for file in files):
         series.check_nothing(files)
     own = {name: whole.findings for name, whole in series.own.items()}  # of two files of one name once
@@ -241,6 +276,9 @@ class _Series:
     """Checks files one after the other, and the links between them."""
 
     def __init__(self, files: Sequence[RecordingAudit], signed: bool, newest: str) -> None:
+        #: Findings of whole files; they come before those within a file.
+        self.own = {file.file: RecordingAudit(file=file.file) for file in files}
+        files = [file for file in files if file.is_recording]
         self._names = {file.original: file for file in files}
         self._first_of: dict[tuple[str, str], str] = {}
         self._removed = {name for file in files for name in file.removed}
@@ -248,8 +286,6 @@ class _Series:
         #: Only the file that was started last may still be without its next seal; a head states which one that is.
         self._live = newest or (max(files, key=lambda file: _started(file.original)).file if files else "")
         self._signed = signed
-        #: Findings of whole files; they come before those within a file.
-        self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         self.remarks: list[Remark] = []
 
     def _find(self, fault: Fault, file: RecordingAudit, **figures: Any) -> None:

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--head: is checked with --public-key, which is not given")
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
-        paths, public_key = [resolved(path) for path in paths], public_key and resolved(public_key)
+        paths, public_key = [path.absolute() for path in paths], public_key and resolved(public_key)
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:
         found = audit(paths, public_key=public_key, head=head, progress=progress, executor=executor)

@@ -240,14 +240,19 @@ def recordings(folder: Path, machine: str) -> list[Path]:
 def recordings_in(given: Iterable[Path]) -> list[Path]:
     """Return the given recordings; a folder is replaced by the recordings in it.
 
+    A folder without any that is named as a recording stands for itself among others, as `rec/*.mcap` may give it.
+
     Raises
     ------
     UsageError
         If there are none in a folder.
     """
     paths: list[Path] = []
+    given = list(given)
     for path in given:
         inside = _found(path, "*.mcap") if path.is_dir() else [path]
+        if not inside and path.suffix == ".mcap" and len(given) > 1:
+            inside = [path]
         if not inside:
             raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
         paths += inside

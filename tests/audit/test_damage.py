@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import struct
 import zlib
@@ -86,6 +87,30 @@ def test_the_command_gives_3_and_audits_the_others(
     assert f"{name}: damaged: byte {at}" in shown and "12 samples" in shown
     paths[0].write_bytes(b"t_s,y_um\n0,1\n")
     assert main(["replay", *map(str, paths)]) == 2
+
+
+@pytest.mark.parametrize("what", ["folder", "loop", "nothing", "pipe", "device"])
+@pytest.mark.parametrize("place", ["x.mcap", "first", "last"])
+def test_what_is_no_file_among_recordings_is_a_finding(
+    tmp_path: Path, made: list[tuple[str, bytes]], what: str, place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = placed(tmp_path, made, -1, b"")
+    path = {"first": paths[0], "last": paths[-1]}.get(place, tmp_path / place)
+    path.unlink(missing_ok=True)
+    if what == "folder":
+        path.mkdir()
+    elif what == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to({"loop": path.name, "nothing": "none", "device": "/dev/zero"}[what])
+    for given in ([tmp_path], sorted(tmp_path.iterdir())):
+        assert main(["replay", *map(str, given)]) == 3
+        shown = capsys.readouterr().out
+        assert f"{path.name}: damaged: not read: " in shown
+        assert f"{18 if place == 'x.mcap' else 12} samples" in shown and "differ in the replay" not in shown
+    # By itself it is a mistake.
+    assert main(["replay", str(path)]) == 2
+    assert main(["replay", str(tmp_path), str(tmp_path / "missing.mcap")]) == 2
 
 
 # ------------------------------------------------------------------ bytes outside records

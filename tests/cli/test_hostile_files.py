@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from compensator.api.diagnosis import diagnose
+from compensator.api.identification import identify
 from compensator.cli import main
 from compensator.config import parse_config
-from compensator.errors import ConfigError, ModelError
+from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.input_file import parse_toml, read_file
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.signature import Signer
@@ -199,6 +201,25 @@ def test_the_output_is_no_input_and_each_model_has_its_own_page(
         line = refused(capsys, "identify", tmp_path / "t.csv", "--reference", reference, "--out", out)
         assert "is an input of this command" in line
     assert reference.read_bytes() == read_model_bytes("quill")
+
+
+def test_a_wrong_reference_is_refused_before_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("compensator.api.identification.calibrate", lambda *_, **__: pytest.fail("fitted"))
+    (tmp_path / "t.csv").write_text(TABLE)
+    (tmp_path / "wrong.toml").write_text("a = 1")
+    for wrong in ("wrong.toml", "missing.toml"):
+        with pytest.raises(CompensatorError, match=wrong):
+            identify(tmp_path / "t.csv", reference=tmp_path / wrong)
+
+
+def test_a_wrong_run_for_validation_is_refused_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("compensator.api.diagnosis.find_effects", lambda *_, **__: pytest.fail("searched"))
+    (tmp_path / "t.csv").write_text(TABLE)
+    (tmp_path / "other.csv").write_text("t_s,t_q_degc,at_degc\n0,20,20\n60,20.1,20\n")
+    with pytest.raises(CompensatorError, match="y_um"):
+        diagnose("quill", tmp_path / "t.csv", validate=tmp_path / "other.csv")
 
 
 def test_a_pipe_as_a_key_ends_at_once(tmp_path: Path) -> None:

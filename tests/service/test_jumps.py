@@ -379,6 +379,39 @@ def test_a_loose_contact_must_be_back_for_longer_each_time(day: dict[str, np.nda
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
 
 
+def loose(channel: str, size: float, begin: int, end: int) -> Change:
+    """A contact that finds another level, or the right one, every few samples."""
+    random, kept = np.random.default_rng(7), {"by": size}
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if begin < i < end and random.random() < 0.2:
+            kept["by"] = size * float(random.choice([0.0, 0.7, 1.0, 1.3]))
+        values[channel] += kept["by"] if begin <= i < end else 0.0
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("channel", "size"), [("t_q_degc", 9.0), ("t_q_degc", -9.0), ("at_degc", 5.0), ("at_degc", -5.0)]
+)
+def test_a_loose_contact_that_comes_to_rest_is_used_again_and_unconfirmed(
+    day: dict[str, np.ndarray], channel: str, size: float
+) -> None:
+    begin, end = 200, 400
+    apart = np.abs(offsets(run(day)) - offsets(outcomes := run(day, loose(channel, size, begin, end))))
+    states = np.array([str(o.offset.state) for o in outcomes])
+    assert not np.any((apart > 5.0) & (states == "ok"))
+    # It must have been at rest for as long as it would have to be back.
+    used = [i for i in events(outcomes, "unconfirmed") if i >= end]
+    assert used and used[0] - end <= 30
+    reasons = outcomes[used[0] + 1].offset.reasons
+    assert f"unconfirmed_channel:{channel}" in reasons and not any("suspect" in one for one in reasons)
+    # Right within an hour: what was lost is interpolated.
+    assert apart[end + 60 :].max() < 3.0
+    resumed = run(day, loose(channel, size, begin, end), lambda i, c: c.resume() if i == end + 60 else None)
+    assert resumed[-1].offset.state == "ok"
+
+
 def test_a_direct_model_keeps_a_suspect_until_an_operator_decides(day: dict[str, np.ndarray]) -> None:
     outcomes = run(day, biased("t_q_degc", 8.0), model=direct("kalman"))
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN:END])

@@ -22,6 +22,8 @@ BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
 _MOST_STEPS = 2
 #: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
 _UNSTEADY = 2
+#: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
+UNSEEN_SAMPLES = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
 BRIDGED_SAMPLES = 480
 #: Deviations at which one sample's evidence is clipped: a switched heat is not evidence against a sensor.
@@ -137,7 +139,7 @@ class JumpEngines:
                     values[name] = value
                 elif name in jumped and not state.is_suspect:
                     new.append(name)
-                elif state.again >= _UNSTEADY:
+                elif is_unsteady(state):
                     values[name] = NAN
                 elif abs(difference - shift) <= most or not state.is_suspect:
                     values[name] = value - shift
@@ -159,8 +161,20 @@ class JumpEngines:
                 state.first_k[name] = first_k if state.is_suspect and not goes_on else difference
         return Fed(values, new)
 
+    def goes_away(self, state: JumpState, offered: Mapping[str, float]) -> bool:
+        """Return whether the channels that have jumped move further away from what the shifted engine expects."""
+        for name in state.shifts_k:
+            expected, _ = expected_value(self.shifted.engine, name, offered["at_degc"])
+            last = state.last.get(name, NAN)
+            if not (offered[name] - last) * (last - expected) > 0.0:
+                return False
+        return True
+
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
+        if is_unsteady(state):
+            # The shifted engine goes without the channel: this would compare what they know, not whether it is right.
+            return
         cost = 0.0
         for run, values, sign in ((self.believing, offered, -0.5), (self.shifted, fed.values, 0.5)):
             for name in TEMPERATURES:
@@ -209,6 +223,24 @@ class JumpEngines:
             return ()
         pairs = zip(believing.outputs, shifted.outputs, strict=True)
         return tuple(abs(one.value - other.value) for one, other in pairs)
+
+
+def is_unsteady(state: JumpState) -> bool:
+    """Return whether the channels that have jumped are those of a loose contact: the shifted engine goes without."""
+    return state.again >= _UNSTEADY and (state.is_suspect or state.is_unconfirmed)
+
+
+def needed_samples(state: JumpState) -> int:
+    """Return for how many samples a suspect channel must be back, or come to rest."""
+    return min(BACK_SAMPLES << min(state.again, 8), MOST_BACK_SAMPLES)
+
+
+def moves(state: JumpState, offered: Mapping[str, float], change_k: Mapping[str, float]) -> bool:
+    """Return whether a loose contact jumps from the last sample to this one, or is open."""
+    return any(
+        state.unseen.get(name, 0) >= UNSEEN_SAMPLES or abs(offered[name] - state.last.get(name, NAN)) > change_k[name]
+        for name in state.shifts_k
+    )
 
 
 def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:

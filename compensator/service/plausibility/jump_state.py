@@ -45,6 +45,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Consecutive samples for which each channel has been back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
+    last : dict of str to float
+        Values of the last sample with a jump under way, °C.
     unseen : dict of str to int
         By channel: samples since its last value.
     is_unconfirmed : bool
@@ -65,6 +67,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
     is_unconfirmed: bool = False
+    last: dict[str, float] = {}
     unseen: dict[str, int] = {}
     samples: int = 0
     ratio: float = 0.0

@@ -25,6 +25,10 @@ a channel that then reads otherwise than expected is *unconfirmed*: heat or air 
 It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
 one of them.
 
+A loose contact jumps again and again: it has no level that the shifted engine could follow, which goes without it. Its
+expectation is soon too wide for a return to show. Once the channel has come to rest, for as long as it would have to be
+back, it is like a couple that was open: used again, and unconfirmed. The believing engine starts with its last jump.
+
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
 
@@ -45,11 +49,14 @@ from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.jump_engines import (
-    BACK_SAMPLES,
-    MOST_BACK_SAMPLES,
+    UNSEEN_SAMPLES,
     JumpEngines,
     Run,
     count_held,
+    expected_value,
+    is_unsteady,
+    moves,
+    needed_samples,
 )
 from compensator.service.plausibility.jump_signs import NAMES, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
@@ -60,8 +67,6 @@ _NATURAL = 0.5
 _AGREES, _AGREES_SAMPLES = 12.0, 10
 #: A jump within the permitted rate is watched for this number of samples, and refuted at this log likelihood ratio.
 WATCHED_SAMPLES, _REFUTED = 15, 12.0
-#: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
-_UNSEEN_SAMPLES = 2
 #: Consecutive samples for which Y must speak for a channel.
 Y_SAMPLES = 10
 #: Probes that must speak for a channel: one may have met a chip.
@@ -167,6 +172,7 @@ class JumpWatch:
             shifts_k=dict(state.shifts_k),
             first_k=dict(state.first_k),
             back=dict(state.back),
+            last=dict(state.last),
             unseen=dict(state.unseen),
         )
 
@@ -240,7 +246,10 @@ class JumpWatch:
         jumped = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         notes: list[Note] = []
         seen_again = self._seen_again(offered)
-        if jumped and self._state.is_unconfirmed:
+        if self._engines is not None and is_unsteady(self._state) and set(jumped) <= set(self._state.shifts_k):
+            if jumped or moves(self._state, offered, self._change_k):
+                notes += self._unsettle(engine, self._engines, offered)
+        elif jumped and self._state.is_unconfirmed:
             self._suspect()
         elif jumped and not self._state.is_suspect:
             self._begin(engine, self._state.begun(is_suspect=True))
@@ -254,6 +263,7 @@ class JumpWatch:
         engines = self._engines
         if engines is None:
             return Judgement()
+        self._state.last = {name: offered[name] for name in TEMPERATURES if not math.isnan(offered[name])}
         fed = engines.feed(self._state, offered, jumped, self._change_k)
         count_held(self._state, engine, offered["at_degc"])
         if fed.jumped and self._state.is_suspect:
@@ -313,6 +323,22 @@ class JumpWatch:
         self._state.is_suspect, self._state.is_unconfirmed = True, False
         self._state.start_evidence()
 
+    def _unsettle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> list[Note]:
+        """Account for a further jump of a loose contact."""
+        state = self._state
+        if state.is_suspect and state.samples <= 1 and engines.goes_away(state, offered):
+            # What goes on from sample to sample is one jump, or heat.
+            state.samples = 0
+            return []
+        engines.believe_as_shifted()
+        state.again += 1
+        if state.is_suspect:
+            state.start_evidence()
+            return []
+        engine.restore(engines.shifted.engine.snapshot())
+        self._suspect()
+        return [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
+
     def _going_on(self, signs: JumpSigns, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
         """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
         shifts = self._state.shifts_k
@@ -324,7 +350,7 @@ class JumpWatch:
         unseen = self._state.unseen
         self._state.unseen = {name: unseen.get(name, 0) + 1 for name in TEMPERATURES if math.isnan(offered[name])}
         return [
-            name for name, samples in unseen.items() if samples >= _UNSEEN_SAMPLES and name not in self._state.unseen
+            name for name, samples in unseen.items() if samples >= UNSEEN_SAMPLES and name not in self._state.unseen
         ]
 
     def _weigh_y(self, engines: JumpEngines, y_um: float) -> None:
@@ -338,7 +364,7 @@ class JumpWatch:
 
     def _suspected(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
         state = self._state
-        needed = min(BACK_SAMPLES * 2 ** min(state.again, 8), MOST_BACK_SAMPLES)
+        needed = needed_samples(state)
         if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
             return self._accept(engine, offered, engines.shifted, "has returned to what was expected before")
         if state.at_held >= needed:
@@ -346,7 +372,22 @@ class JumpWatch:
         by = self._confirmed_by()
         if by:
             return self._accept(engine, offered, engines.believing, f"is used again: {by} with it")
+        if is_unsteady(state) and state.samples >= needed and not any(map(math.isnan, offered.values())):
+            return self._settle(engine, engines, offered)
         return Judgement()
+
+    def _settle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
+        """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
+        state = self._state
+        notes = []
+        for name in state.shifts_k:
+            expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
+            state.shifts_k[name] = offered[name] - expected
+            notes.append(unconfirmed_note(name, state.shifts_k[name]))
+        engine.restore(engines.believing.engine.snapshot())
+        state.is_suspect, state.is_unconfirmed = False, True
+        state.samples, state.ratio = 0, 0.0
+        return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
 
     def _confirmed_by(self) -> str:
         """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
@@ -384,7 +425,9 @@ class JumpWatch:
             by = self._confirmed_by()
             if by:
                 return self._accept(engine, offered, None, f"is confirmed: {by} with it")
-            is_refuted |= state.y_against >= Y_SAMPLES or state.probes_against >= _PROBES
+            # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
+            against = state.y_against >= Y_SAMPLES or state.probes_against >= _PROBES
+            is_refuted |= against and not is_unsteady(state)
         if is_refuted:
             engine.restore(shifted.engine.snapshot())
             estimate = shifted.estimate
