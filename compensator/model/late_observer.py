@@ -75,19 +75,20 @@ class LateObserver(Observer):
 
     def _run_on(self) -> None:
         """Continue from the past to the present without T_Q."""
-        past = self._past
+        past, covariance = self._past, self._covariance
         complete = past.settled and all(extra == 0.0 for _, extra in self._ambients)
-        self._x, self._started = past.x, past.started
+        self._x = past.x
         if complete and self._steady_for is past.covariance:
+            covariance.started = past.started
             for (at_k, _), gain in zip(self._ambients, self._steady_ahead, strict=True):
                 self._x = self._moved(self._x)
                 self._correct(gain, at_k - self._x[self._a])
             return
-        self._P = past.covariance
+        covariance.follow(past._covariance)
         gains = []
         for at_k, extra in self._ambients:
             self._x = self._moved(self._x)
-            gain, _ = self._recurse(None if extra == _MISSING else self._r_at + extra, None, complete=False)
+            gain = covariance.step(None if extra == _MISSING else extra, None).at
             if extra != _MISSING:
                 self._correct(gain, at_k - self._x[self._a])
             gains.append(gain)

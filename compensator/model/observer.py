@@ -17,34 +17,21 @@ Both ways to estimate the heat are observers of this system; only their gains di
 - `inverse`: a = AT and q = (T_Q − AT − C₁ x₁) / D₁, which is exactly the paper's TTF⁻¹;
 - `kalman`: the optimal gains for white sensor noise.
 
-A missing measurement skips its update: the drive keeps its value, the state moves on, and the
-covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
-order of summation depends on the processor: the same inputs give the same bits on every machine, which is
-what lets an audit compare bit by bit. Once *P* has settled, its recursion is skipped until a sample is
-missing. *P* depends on no measured value, only on which are missing: observers of one design share its steps.
-
-Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
+A missing measurement skips its update: the drive keeps its value, the state moves on. The gains, and how uncertain the
+state is, are those of its covariance (`covariance`), into which no measured value enters. Arithmetic is scalar float or
+element-wise, never a matrix product of a BLAS, whose order of summation depends on the processor: the same inputs give
+the same bits on every machine, which is what lets an audit compare bit by bit.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import NamedTuple
-
-import numpy as np
+from dataclasses import dataclass
 
 from compensator.arrays import Matrix
+from compensator.model.covariance import Covariance, Design, Terms
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
-
-#: P counts as settled when no element moves by more than this, relative to its standard deviations.
-SETTLED = 1e-7
-
-#: So many steps of the covariance are kept for each of so many designs: it is the same in every run from rest. About
-#: 1,000 lead to the steady state, as many after a gap; one takes 3 to 7 kB.
-_KEPT_STEPS, _KEPT_DESIGNS = 2048, 4
 
 _UNITY = SampledTransferFunction(b=(1.0,), a=(1.0,), period_s=60.0)
 _ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
@@ -90,63 +77,6 @@ class Forecast:
     at_std_k: float
 
 
-@dataclass(slots=True)
-class _Ahead:
-    """What follows from a covariance alone, as far as it has been asked for.
-
-    Parameters
-    ----------
-    of : numpy.ndarray, shape (n, n)
-        The covariance after a sample; never changed once it is set.
-    p : numpy.ndarray, shape (n, n), optional
-        That of one sample later, before its measurements.
-    with_at : tuple of list of float and numpy.ndarray, optional
-        Gain of an AT that is measured then, and the covariance with it.
-    t_q_std : dict of bool to float
-        Standard deviation of what T_Q will measure, K, with AT measured and without.
-    """
-
-    of: Matrix
-    p: Matrix | None = None
-    with_at: tuple[list[float], Matrix] | None = None
-    t_q_std: dict[bool, float] = field(default_factory=dict)
-
-
-class _Step(NamedTuple):
-    """A step of the covariance, which depends on no measured value: shared by all observers of the same design.
-
-    Parameters
-    ----------
-    ahead : _Ahead
-        Covariance after the sample, and what follows from it.
-    gain_at, gain_tq : list of float
-        Gains for AT and T_Q; empty where missing.
-    y_var : float
-        Variance of y, µm².
-    settled : bool
-        Whether the covariance has reached its steady value.
-    """
-
-    ahead: _Ahead
-    gain_at: list[float]
-    gain_tq: list[float]
-    y_var: float
-    settled: bool
-
-
-@lru_cache(maxsize=_KEPT_DESIGNS)
-def _steps_of(design: tuple[object, ...]) -> dict[tuple[object, ...], _Step]:
-    """Return the steps that observers of a design have made."""
-    return {}
-
-
-def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
-    """Return P − K L' − L K' + K S K' with L = P H', which is right for any gain K."""
-    cross = np.multiply.outer(gain, column)
-    corrected: Matrix = p - (cross + cross.T) + s * np.multiply.outer(gain, gain)
-    return corrected
-
-
 class Observer:
     """The augmented observer of a thermal model.
 
@@ -166,9 +96,6 @@ class Observer:
             ambient = lag if late.of_ambient else _UNITY
         tdtf = model.tdtf.sampled if model.tdtf else _ZERO
         estimator = model.estimator
-        self._kalman = estimator.method == "kalman"
-        self._r_tq = estimator.t_q_noise_std_k**2
-        self._r_at = estimator.at_noise_std_k**2
         further = [
             function
             for part in model.parts
@@ -176,16 +103,22 @@ class Observer:
         ]
         self._lay_out(ttf, model.dtf.sampled, tdtf, ambient, *further)
         self._outputs = self._output_rows(model)
-        self._walk = np.zeros(self.size)
-        self._walk[self._q] = estimator.drive_walk_std**2
-        self._walk[self._a] = estimator.at_walk_std_k**2
-        upper, right = np.triu_indices(self.size)
-        self._upper, self._lower = upper * self.size + right, right * self.size + upper
-        #: States of y and their weights.
         weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
-        self._of_y = [(index, weight) for index, weight in weights if index < self.size]
-        noise = (self._kalman, self._r_tq, self._r_at, *self._walk.tolist())
-        self._steps = _steps_of((noise, tuple(self._rows), tuple(self._first), tuple(self._d), tuple(self._of_y)))
+        self._covariance = Covariance(
+            Design(
+                rows=tuple(self._rows),
+                first=tuple(self._first),
+                feed=tuple(self._d),
+                of_y=tuple((index, weight) for index, weight in weights if index < self.size),
+                walk=(*[0.0] * self._q, estimator.drive_walk_std**2, estimator.at_walk_std_k**2),
+                t_q_var_k2=estimator.t_q_noise_std_k**2,
+                at_var_k2=estimator.at_noise_std_k**2,
+                kalman=estimator.method == "kalman",
+            )
+        )
+        #: Variances of the further outputs, and the covariance that they are of.
+        self._output_vars: list[float] = []
+        self._output_vars_of: Matrix | None = None
         self.reset()
 
     def _lay_out(self, *functions: SampledTransferFunction) -> None:
@@ -208,16 +141,12 @@ class Observer:
             start += n
         rows += [(self._q, nil, nil, 0.0, 0.0), (self._a, nil, nil, 0.0, 0.0)]
         self._rows = rows
-        next_row, first_row, source_row, a_column, b_column = (np.array(column) for column in zip(*rows, strict=True))
-        self._gathered = np.array((next_row, first_row, source_row))
-        self._factors = np.array((a_column, b_column))[:, :, None]
-        self._padded: Matrix = np.zeros((self.size + 1, self.size))
 
     def _paths_of(self, part: int) -> tuple[int, int]:
         """Return the numbers of DTF and TDTF of a part of the model; 0 is the first."""
         return (1, 2) if part == 0 else (2 * part + 2, 2 * part + 3)
 
-    def _output_rows(self, model: ThermalModel) -> list[list[tuple[int, float]]]:
+    def _output_rows(self, model: ThermalModel) -> list[Terms]:
         """Return for each further output the states that it consists of, with their factors."""
         numbers = {part.axis: i for i, part in enumerate((model, *model.parts))}
         rows = []
@@ -234,14 +163,7 @@ class Observer:
     def reset(self) -> None:
         """Return to rest: every state zero and known."""
         self._x = [0.0] * (self.size + 1)
-        self._P: Matrix = np.zeros((self.size, self.size))
-        self._ahead = _Ahead(self._P)
-        self._settled = False
-        self._started = False
-        self._steady: tuple[list[float], list[float]] = ([], [])
-        self._y_var = 0.0
-        #: Variances of the further outputs; None where the covariance has changed since.
-        self._output_vars: list[float] | None = None
+        self._covariance.reset()
 
     # ------------------------------------------------------------------ one sample
 
@@ -256,20 +178,14 @@ class Observer:
             Variance added to that of the sensor, K², for a value that was interpolated.
         """
         has_tq, has_at = not math.isnan(t_q_k), not math.isnan(at_k)
-        complete = has_tq and has_at and extra_t_q_k2 == extra_at_k2 == 0.0
-        if self._started:
+        if self._covariance.started:
             self._x = self._moved(self._x)
-        if self._settled and complete:
-            gain_at, gain_tq = self._steady
-        else:
-            r_at = self._r_at + extra_at_k2 if has_at else None
-            r_tq = self._r_tq + extra_t_q_k2 if has_tq else None
-            gain_at, gain_tq = self._recurse(r_at, r_tq, complete)
+        gains = self._covariance.step(extra_at_k2 if has_at else None, extra_t_q_k2 if has_tq else None)
         if has_at:
-            self._correct(gain_at, at_k - self._x[self._a])
+            self._correct(gains.at, at_k - self._x[self._a])
         if has_tq:
-            self._correct(gain_tq, t_q_k - self._expected_t_q())
-        self._started = True
+            self._correct(gains.t_q, t_q_k - self._t_q_of(self._x))
+        self._covariance.started = True
 
     def _moved(self, x: list[float]) -> list[float]:
         moved = [x[n] - a * x[f] + b * x[s] for n, f, s, a, b in self._rows]
@@ -280,9 +196,6 @@ class Observer:
         x = [value + k * innovation for value, k in zip(self._x, gain, strict=False)]
         x.append(0.0)
         self._x = x
-
-    def _expected_t_q(self) -> float:
-        return self._t_q_of(self._x)
 
     def _t_q_of(self, x: list[float]) -> float:
         expected = x[self._first[0]] + self._d[0] * x[self._q] + self._d[3] * x[self._a]
@@ -296,121 +209,18 @@ class Observer:
         at_k : float
             AT of that sample as a change from its reference, K, from which T_Q is then expected; NaN where missing.
         """
-        x = self._moved(self._x) if self._started else self._x
-        p, has_at = self._moved_ahead(), not math.isnan(at_k)
-        at_expected, at_variance = x[self._a], float(p[self._a, self._a]) + self._r_at
+        x, has_at = self._moved(self._x) if self.started else self._x, not math.isnan(at_k)
+        at_expected = x[self._a]
         if has_at:
-            gain, p = self._ahead_with_at()
             innovation = at_k - at_expected
-            x = [value + k * innovation for value, k in zip(x, gain, strict=False)]
+            x = [value + k * innovation for value, k in zip(x, self._covariance.expected_gain_at(), strict=False)]
             x.append(0.0)
-        t_q_std = self._ahead.t_q_std.get(has_at)
-        if t_q_std is None:
-            t_q_std = self._ahead.t_q_std[has_at] = math.sqrt(max(self._t_q_column(p, self._r_tq)[1], 0.0))
-        return Forecast(self._t_q_of(x), t_q_std, at_expected, math.sqrt(at_variance))
+        t_q_std = self._covariance.expected_t_q_std_k(with_at=has_at)
+        return Forecast(self._t_q_of(x), t_q_std, at_expected, self._covariance.expected_at_std_k())
 
     def drive_for(self, t_q_k: float) -> float:
         """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
         return self._x[self._q] + (t_q_k / self._d[0] if self._d[0] != 0.0 else math.copysign(math.inf, t_q_k))
-
-    # ------------------------------------------------------------------ covariance
-
-    def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
-        """Propagate the covariance by one sample and return the gains for AT and T_Q (None: missing)."""
-        key = (self._P.tobytes(), self._started, r_at, r_tq, complete)
-        step = self._steps.get(key)
-        if step is None:
-            step = self._computed_step(r_at, r_tq, complete)
-            if len(self._steps) >= _KEPT_STEPS:
-                self._steps.clear()
-            self._steps[key] = step
-        self._ahead, gain_at, gain_tq, self._y_var, self._settled = step
-        self._P, self._output_vars = self._ahead.of, None
-        if self._settled:
-            self._steady = self._steady_gains()
-        return gain_at, gain_tq
-
-    def _computed_step(self, r_at: float | None, r_tq: float | None, complete: bool) -> _Step:
-        p = self._moved_ahead()
-        gain_at: list[float] = []
-        gain_tq: list[float] = []
-        if r_at is not None:
-            gain_at, p = self._ahead_with_at() if r_at == self._r_at else self._update_at(p, r_at)
-        if r_tq is not None:
-            gain_tq, p = self._update_t_q(p, r_tq)
-        settled = complete and self._started and _has_settled(self._P, p)
-        return _Step(_Ahead(p), gain_at, gain_tq, _variance(self._of_y, p.tolist()), settled)
-
-    def _steady_gains(self) -> tuple[list[float], list[float]]:
-        """Compute the gains of the steady state, a function of *P* alone so that a restart finds the same."""
-        gain_at, p = self._update_at(self._moved_covariance(self._P), self._r_at)
-        gain_tq, _ = self._update_t_q(p, self._r_tq)
-        return gain_at, gain_tq
-
-    def _f_times(self, matrix: Matrix) -> Matrix:
-        self._padded[:-1] = matrix
-        rows = self._padded.take(self._gathered, axis=0)
-        rows[1:] *= self._factors
-        product: Matrix = rows[0]
-        product -= rows[1]
-        product += rows[2]
-        return product
-
-    def _moved_covariance(self, p: Matrix) -> Matrix:
-        moved = self._f_times(self._f_times(p).T)
-        # Symmetric to the bit, because a snapshot keeps the upper triangle only.
-        flat = moved.reshape(-1)
-        flat.put(self._lower, flat.take(self._upper))
-        flat[:: self.size + 1] += self._walk
-        return moved
-
-    def _moved_ahead(self) -> Matrix:
-        """Return the covariance one sample ahead, which forecasts and the next sample share."""
-        if self._ahead.of is not self._P:
-            self._ahead = _Ahead(self._P)
-        if self._ahead.p is None:
-            self._ahead.p = self._moved_covariance(self._P) if self._started else self._P
-        return self._ahead.p
-
-    def _ahead_with_at(self) -> tuple[list[float], Matrix]:
-        """Return the gain of an AT that was measured, and the covariance one sample ahead with it."""
-        p = self._moved_ahead()
-        if self._ahead.with_at is None:
-            self._ahead.with_at = self._update_at(p, self._r_at)
-        return self._ahead.with_at
-
-    def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
-        column = p[:, self._a]
-        s = float(column[self._a]) + variance
-        if self._kalman:
-            gain = column / s
-        else:
-            gain = np.zeros(self.size)
-            gain[self._a] = 1.0
-        return gain.tolist(), _corrected(p, gain, column, s)
-
-    def _t_q_column(self, p: Matrix, variance: float) -> tuple[Matrix, float]:
-        """Return the covariance of the states with T_Q, and the variance of T_Q as it is measured."""
-        column = self._d[0] * p[:, self._q] + self._d[3] * p[:, self._a]
-        states = [first for first in (self._first[0], self._first[3]) if first < self.size]
-        for first in states:
-            column = column + p[:, first]
-        s = self._d[0] * float(column[self._q]) + self._d[3] * float(column[self._a]) + variance
-        for first in states:
-            s += float(column[first])
-        return column, s
-
-    def _update_t_q(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
-        column, s = self._t_q_column(p, variance)
-        if self._kalman:
-            gain = column / s
-        else:
-            gain = np.zeros(self.size)
-            gain[self._q] = 1.0 / self._d[0]
-        return gain.tolist(), _corrected(p, gain, column, s)
-
-    def _variance_of_y(self) -> float:
-        return _variance(self._of_y, self._P.tolist())
 
     # ------------------------------------------------------------------ estimates
 
@@ -422,17 +232,17 @@ class Observer:
     @property
     def covariance(self) -> Matrix:
         """Its covariance."""
-        return self._P
+        return self._covariance.p
 
     @property
     def settled(self) -> bool:
         """Whether the covariance has reached its steady value."""
-        return self._settled
+        return self._covariance.settled
 
     @property
     def started(self) -> bool:
         """Whether there was a sample since it was at rest."""
-        return self._started
+        return self._covariance.started
 
     @property
     def drive(self) -> float:
@@ -447,19 +257,18 @@ class Observer:
     @property
     def drive_std(self) -> float:
         """Standard deviation of the drive, in its unit."""
-        return math.sqrt(max(float(self._P[self._q, self._q]), 0.0))
+        return math.sqrt(max(float(self._covariance.p[self._q, self._q]), 0.0))
 
     @property
     def y_variance_um2(self) -> float:
         """Variance of y that sensor noise and missing samples cause, µm²."""
-        return self._y_var
+        return self._covariance.y_var
 
     @property
     def output_variances(self) -> list[float]:
         """Variance of each further output that sensor noise and missing samples cause, in its unit squared."""
-        if self._output_vars is None:
-            covariance = self._P.tolist()
-            self._output_vars = [_variance(row, covariance) for row in self._outputs]
+        if self._output_vars_of is not self._covariance.p:
+            self._output_vars, self._output_vars_of = self._covariance.variances_of(self._outputs), self._covariance.p
         return self._output_vars
 
     def shares_um(self) -> tuple[float, float]:
@@ -481,7 +290,7 @@ class Observer:
 
     def covariance_ahead(self) -> Matrix:
         """Return the covariance one sample ahead, before its measurements."""
-        return self._moved_ahead()
+        return self._covariance.ahead()
 
     def widen(self, ahead: Matrix) -> None:
         """Set the covariance after a gap whose inputs were interpolated.
@@ -495,18 +304,7 @@ class Observer:
         ahead : numpy.ndarray, shape (n, n)
             Covariance before the measurements of the present sample, of an observer that skipped the gap.
         """
-        column = ahead[:, self._a]
-        gain = column / (float(column[self._a]) + self._r_at)
-        p = _corrected(ahead, gain, column, float(column[self._a]) + self._r_at)
-        column, s = self._t_q_column(p, self._r_tq)
-        gain = column / s
-        walked, walked_var = self._P, self._y_var
-        self._P = _corrected(p, gain, column, s)
-        self._y_var, self._output_vars = self._variance_of_y(), None
-        if self._y_var > walked_var:
-            self._settled = False
-        else:
-            self._P, self._y_var = walked, walked_var
+        self._covariance.widen(ahead)
 
     # ------------------------------------------------------------------ state
 
@@ -514,9 +312,9 @@ class Observer:
         """Return what must be kept to continue from here with the same bits."""
         return ObserverState(
             x=tuple(self._x[: self.size]),
-            p=tuple(self._P.take(self._upper).tolist()),
-            settled=self._settled,
-            started=self._started,
+            p=self._covariance.upper_triangle(),
+            settled=self.settled,
+            started=self.started,
         )
 
     def restore(self, state: ObserverState) -> None:
@@ -527,33 +325,7 @@ class Observer:
         ValueError
             If the snapshot belongs to a model of another size.
         """
-        if len(state.x) != self.size or len(state.p) != self._upper.size:
+        if len(state.x) != self.size:
             raise ValueError(f"snapshot of {len(state.x)} states, the model has {self.size}")
+        self._covariance.restore(state.p, started=state.started, settled=state.settled)
         self._x = [*state.x, 0.0]
-        self._P = np.zeros((self.size, self.size))
-        flat = self._P.reshape(-1)
-        flat[self._upper] = flat[self._lower] = state.p
-        self._started = state.started
-        self._y_var, self._output_vars = self._variance_of_y(), None
-        self._settled = state.settled
-        if state.settled:
-            self._steady = self._steady_gains()
-
-
-def _has_settled(before: Matrix, p: Matrix) -> bool:
-    variances = p.diagonal()
-    deviation = np.sqrt(np.maximum(variances, 0.0))
-    # The variances alone show most of the way that it has not.
-    if (np.abs(variances - before.diagonal()) > SETTLED * (deviation * deviation)).any():
-        return False
-    scale = np.multiply.outer(deviation, deviation)
-    return bool((np.abs(p - before) <= SETTLED * scale).all())
-
-
-def _variance(terms: list[tuple[int, float]], covariance: list[list[float]]) -> float:
-    """Return the variance of a sum of states with their weights."""
-    total = 0.0
-    for i, wi in terms:
-        for j, wj in terms:
-            total += wi * wj * covariance[i][j]
-    return max(total, 0.0)

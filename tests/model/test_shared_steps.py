@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 
-from compensator.model import observer
+from compensator.model import covariance
 from compensator.model.engine import Engine, Estimate
-from compensator.model.observer import Forecast
-from compensator.model.thermal_model import ThermalModel
+from compensator.model.late_observer import observer_of
+from compensator.model.observer import Forecast, Observer
+from compensator.model.thermal_model import Path, ThermalModel
 from tests.service.records import QUILL, direct, late, with_method
 
 N = 300
@@ -38,13 +41,13 @@ def day(model: ThermalModel, seed: int) -> tuple[list[Estimate], list[Forecast]]
     ids=["kalman", "inverse", "late", "direct"],
 )
 def test_the_second_of_a_design_has_the_bits_of_the_first(model: ThermalModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    observer._steps_of.cache_clear()
+    covariance._shared.clear()
     first = repr(day(model, 1))
     other = repr(day(model, 2))
     assert repr(day(model, 1)) == first, "with what another run has left"
-    monkeypatch.setattr(observer, "_KEPT_STEPS", 3)
+    monkeypatch.setattr(covariance, "_KEPT_BYTES", 10_000)
     assert repr(day(model, 1)) == first, "with hardly anything kept"
-    observer._steps_of.cache_clear()
+    covariance._shared.clear()
     assert repr(day(model, 2)) == other, "alone"
 
 
@@ -54,17 +57,75 @@ def test_designs_share_nothing() -> None:
     models = (QUILL, dataclasses.replace(QUILL, estimator=estimator), with_method("inverse"), late(QUILL))
     alone = []
     for model in models:
-        observer._steps_of.cache_clear()
+        covariance._shared.clear()
         alone.append(repr(day(model, 3)))
     assert len(set(alone)) == len(models)
-    observer._steps_of.cache_clear()
+    covariance._shared.clear()
     assert [repr(day(model, 3)) for model in models] == alone
 
 
+def test_a_zero_of_another_sign_is_another_design() -> None:
+    dtf = QUILL.dtf.sampled
+    zeros = [
+        dataclasses.replace(
+            QUILL, dtf=Path(unit=QUILL.dtf.unit, sampled=dataclasses.replace(dtf, b=(zero, *dtf.b[1:])))
+        )
+        for zero in (0.0, -0.0)
+    ]
+    assert zeros[0].dtf == zeros[1].dtf
+    covariance._shared.clear()
+    for model in zeros:
+        Observer(model).step(0.0, 0.0)
+    assert len(covariance._shared.steps) == 2
+
+
+@pytest.mark.parametrize("method", ["kalman", "inverse"])
+def test_one_that_is_still_at_rest_leaves_nothing_to_one_that_moves(method: str) -> None:
+    """A late T_Q that is restored before its first sample runs on from rest, where its covariance does not move."""
+    model = late(with_method(method))
+
+    def first_without_t_q() -> str:
+        fresh = Observer(model)
+        fresh.step(math.nan, 0.1)
+        return repr((fresh.forecast(0.1), fresh.forecast(math.nan), fresh.step(0.2, 0.1), fresh.snapshot()))
+
+    covariance._shared.clear()
+    alone = first_without_t_q()
+    covariance._shared.clear()
+    at_rest = observer_of(model)
+    at_rest.restore(at_rest.snapshot())
+    at_rest.forecast(0.1)
+    at_rest.forecast(math.nan)
+    assert first_without_t_q() == alone
+
+
+def test_a_step_takes_no_more_memory_than_is_counted() -> None:
+    for model in (QUILL, late(QUILL), direct("kalman")):
+        observer = Observer(model)
+        covariance._shared.clear()
+        tracemalloc.start()
+        try:
+            for i in range(300):
+                observer.forecast(0.1)
+                observer.forecast(math.nan)
+                observer.step(math.nan if i % 50 == 0 else 0.1, 0.1)
+            gc.collect()
+            taken = tracemalloc.get_traced_memory()[0]
+        finally:
+            tracemalloc.stop()
+        assert len(covariance._shared.steps) == 300
+        assert 0.7 * covariance._shared.bytes < taken < covariance._shared.bytes
+
+
 def test_what_is_kept_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(observer, "_KEPT_STEPS", 50)
-    observer._steps_of.cache_clear()
-    engine = Engine(QUILL)
-    day(QUILL, 4)
-    kept = engine._observer._steps
-    assert 0 < len(kept) <= 50
+    """That of all designs together, whether or not their observers are still there."""
+    monkeypatch.setattr(covariance, "_KEPT_BYTES", 100_000)
+    covariance._shared.clear()
+    observers = [Observer(model) for model in (QUILL, with_method("inverse"), late(QUILL), direct("kalman"))]
+    most = 0
+    for _ in range(100):
+        for observer in observers:
+            observer.step(0.1, 0.1)
+            most = max(most, covariance._shared.bytes)
+    assert 90_000 < most <= 100_000
+    assert 0 < len(covariance._shared.steps) < 100
