@@ -157,6 +157,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if given.debug:
             raise
         log.error("compensator: %s", _in_words(error))
+        result = getattr(error, "result", None)
+        if given.json and result is not None:
+            sys.stdout.write(f"{json.dumps(result)}\n")
         return getattr(error, "exit_code", 1)
     except KeyboardInterrupt:
         return 130

@@ -14,6 +14,9 @@ Errors of devices are `drivers.DriverError`; the sampler turns them into qualiti
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class CompensatorError(Exception):
     """Base of all errors of the compensator."""
@@ -46,4 +49,8 @@ class DataError(CompensatorError):
 
 
 class ServiceError(CompensatorError):
-    """The service cannot continue."""
+    """The service cannot continue, or refuses; `result` is what it says for programs, as for `--json`."""
+
+    def __init__(self, text: str, result: Mapping[str, Any] | None = None) -> None:
+        super().__init__(text)
+        self.result = result

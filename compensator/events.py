@@ -196,7 +196,8 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     ratio : float, optional
         Root mean square of the changes of the other model's residual over that of the present one's.
     y_moved : bool
-        Whether the errors about the zero contradict the verdict, because measured Y has moved by itself.
+        Whether the errors about the zero contradict the verdict: measured Y has moved by itself, or an effect has moved
+        it since the zero that the other model counts otherwise.
     offset_change_um : float, optional
         By how much the offset would move at the end of the recordings, µm.
     axes : dict of str to ComparisonData

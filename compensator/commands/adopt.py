@@ -42,7 +42,11 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     if model.sha256 == setup.model.sha256:
         raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
-    refuse_if_worse(found, model, force=arguments.force)
+    try:
+        refuse_if_worse(found, model, force=arguments.force)
+    except ServiceError as error:
+        refused = {"ok": False, "service_reached": False, "model_sha256": model.sha256, "text": str(error)}
+        raise ServiceError(str(error), refused | {"comparison": found.table()}) from error
     setup.store.adopt(data, name=model.name, time_utc_ns=SystemClock().utc_ns())
     return _stored(f"model {model.name} ({model.sha256[:12]}) is stored in {setup.store.folder}", model.sha256, found)
 

@@ -63,5 +63,5 @@ def operator_of(arguments: argparse.Namespace) -> Operator | None:
 def answered(reply: dict[str, Any], **more: Any) -> Answer:
     """Return the service's reply, with more for `--json`; raise an error if it refused."""
     if not reply.get("ok"):
-        raise ServiceError(f"the service refused: {reply.get('text', 'no reason given')}")
+        raise ServiceError(f"the service refused: {reply.get('text', 'no reason given')}", {**reply, **more})
     return Answer({**reply, **more}, str(reply.get("text", "")))

@@ -50,7 +50,8 @@ def run(arguments: argparse.Namespace) -> Answer | None:
     """
     loaded = load_config(arguments.config) if arguments.config else None
     source = _source(arguments, loaded)
-    shop = Shop(SystemClock())
+    config_of = {loaded.config.zenoh.prefix: str(arguments.config)} if loaded is not None else {}
+    shop = Shop(SystemClock(), config_of)
     if loaded is not None:
         folder = loaded.resolve(loaded.config.recording.folder)
         shop.add_recorded(

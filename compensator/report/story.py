@@ -99,6 +99,8 @@ class Story:
     needs: str = ""
     _decided: Step | None = None
     _sender: str = ""
+    #: Hashes of what was proposed: the same one again is no other proposal.
+    _proposed: set[str] = field(default_factory=set)
 
     @property
     def is_empty(self) -> bool:
@@ -155,7 +157,10 @@ class Story:
         self._sender = ""
 
     def _append(self, step: Step) -> None:
-        self.counts[step.what] += 1
+        is_again = step.what == LoopAction.PROPOSE and step.model_sha256 in self._proposed
+        self.counts[step.what] += not is_again
+        if step.what == LoopAction.PROPOSE:
+            self._proposed.add(step.model_sha256)
         if step.what != LoopAction.DIAGNOSE:
             self.steps = [*self.steps[1 - STEPS :], step]
 

@@ -22,6 +22,7 @@ from compensator.service.probing.received import ProbeRefused, unused_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, longest, refusal
 from compensator.service.replay import execute
 from compensator.service.transfer.adoption import Adoption, ModelRequest
+from compensator.service.transfer.second_opinion import described
 
 #: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
@@ -139,20 +140,24 @@ class Commands:
         """Answer a command about the candidate of the loop; it acts with the next sample. In the loop only."""
         try:
             if self._models is None:
-                raise ServiceError("the configuration has no loop; expected [loop] with a policy")
+                raise ServiceError(
+                    'the service looks for no better model; expected [loop] with policy = "propose" or "adopt"'
+                )
             if self._loop is None:
                 raise ServiceError("the service is ending")
             if self._is_answered:
                 raise ServiceError("the candidate was answered already, which acts at the next sample")
-            text = self._models.offer(force=request.force or name == CommandName.DISMISS)
+            offer = self._models.offer(self._running(), force=request.force or name == CommandName.DISMISS)
         except ServiceError as error:
             self._note_refusal(name, f"{name}: {error}", sender)
             reply.set_result(refusal(f"{name}: {error}"))
             return
         self._is_answered = True
         self._enqueue(name, {"candidate": True, "force": request.force}, sender)
-        text = text if name == CommandName.ADOPT else f"dismissed: {text.replace(' is adopted;', ';')}"
-        reply.set_result({"ok": True, "text": f"{text}; acts at the next sample"})
+        done = "is adopted" if name == CommandName.ADOPT else "is dismissed"
+        text = f"candidate {offer.named} {done}; {described(offer.comparison)}; acts at the next sample"
+        figures = {"model_sha256": offer.sha256, "comparison": offer.comparison.table()}
+        reply.set_result({"ok": True, "text": text} | figures)
 
     def drain_probes(self) -> tuple[list[ReceivedProbe], list[Probe]]:
         """Return the probes that arrived since the last call, and records of those that are not decided."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from msgspec import UnsetType
 
 from compensator.clock import NS
-from compensator.messages import EstimateMessage, Offset, Sample, Status
+from compensator.messages import Candidate, EstimateMessage, Offset, Sample, Status
 
 #: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
@@ -79,6 +79,14 @@ class MachineHistory:
         point = self._points.get(status.time_utc_ns // STEP_NS)
         if not isinstance(status.loop, UnsetType) and point is not None and point["seq"] == status.seq:
             point["candidate_um"] = status.loop.y_pred_um
+
+    def add_recorded_candidate(self, message: Candidate) -> None:
+        """Add a recorded prediction of a model in shadow: of two that of the candidate, as a status has it."""
+        point = self._points.get(message.time_utc_ns // STEP_NS)
+        if point is None or point["seq"] != message.seq:
+            return
+        if message.role == "candidate" or "candidate_um" not in point:
+            point["candidate_um"] = message.y_pred_um
 
     def prune(self, now_ns: int) -> None:
         """Remove points older than a day."""

@@ -12,20 +12,21 @@ from msgspec import UNSET, UnsetType
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
-from compensator.messages import SCHEMA, EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages import SCHEMA, Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
 from compensator.watch.axes import axis_snapshot, worst
 from compensator.watch.cutting import Headline, headline
 from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import (
-    LOOP_COMMANDS,
+    CONFIG,
     TONES,
     ExplainedCode,
     Tone,
     age,
     explained,
     explained_together,
+    loop_commands,
     loop_text,
     to_do,
 )
@@ -91,10 +92,12 @@ class WatchedMachine:
     ----------
     prefix : str
         Part of its keys before `/thermal/`.
+    config : str
+        Its configuration file, for the commands that a person is shown.
     """
 
-    def __init__(self, prefix: str) -> None:
-        self.prefix = prefix
+    def __init__(self, prefix: str, config: str = CONFIG) -> None:
+        self.prefix, self.config = prefix, config
         self.name = prefix.rpartition("/")[2]
         #: Whether its liveliness token exists; None if unknown.
         self.alive: bool | None = None
@@ -191,9 +194,11 @@ class WatchedMachine:
         setattr(self, name, message)
         return True
 
-    def add_recorded(self, message: Sample | EstimateMessage | Offset | Event) -> None:
+    def add_recorded(self, message: Sample | EstimateMessage | Offset | Candidate | Event) -> None:
         """Add a message of a recording to the history; a recorded offset is never shown as current."""
-        if not isinstance(message, Event):
+        if isinstance(message, Candidate):
+            self.history.add_recorded_candidate(message)
+        elif not isinstance(message, Event):
             self.history.add(message)
             if not isinstance(message, Offset):
                 self._keep(message)
@@ -365,13 +370,12 @@ class WatchedMachine:
             "tolerance_um": status.wanted_tolerance_um,
         }
 
-    @staticmethod
-    def _loop(status: Status | None) -> dict[str, Any] | None:
+    def _loop(self, status: Status | None) -> dict[str, Any] | None:
         """Return how the loop is, with its line and its commands; None for a machine without one."""
         if status is None or isinstance(status.loop, UnsetType):
             return None
         found = msgspec.structs.asdict(status.loop)
-        commands = LOOP_COMMANDS if status.loop.phase in ("shadow", "proposed") else ()
+        commands = loop_commands(self.config) if status.loop.phase == "proposed" else ()
         return found | {"line": loop_text(found), "commands": list(commands)}
 
     def _fresh(self, message: Any, now_ns: int) -> bool:
@@ -411,9 +415,13 @@ class WatchedMachine:
         temperatures = {name: usable(sample, name) for name in ("t_q_degc", "at_degc")}
         return {**temperatures, "period_s": sample.period_s, "channels": channels}
 
-    @staticmethod
-    def _event(event: Event) -> dict[str, Any]:
-        return {"time_utc_ns": event.time_utc_ns, "kind": event.kind, "text": event.text, "do": to_do(event)}
+    def _event(self, event: Event) -> dict[str, Any]:
+        return {
+            "time_utc_ns": event.time_utc_ns,
+            "kind": event.kind,
+            "text": event.text,
+            "do": to_do(event, self.config),
+        }
 
 
 def _tone(shown: str, warnings: list[Remark]) -> Tone:

@@ -7,14 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 
 from compensator.errors import DataError
-from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample
 from compensator.recording.reading import messages, recordings
 from compensator.watch.history import SPAN_NS
 
-_TOPICS = ("sample", "estimate", "offset", "event")
+_TOPICS = ("sample", "estimate", "offset", "candidate", "event")
 
 
-def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | EstimateMessage | Offset | Event]:
+def last_day(
+    folder: Path, machine: str, now_ns: int
+) -> Iterator[Sample | EstimateMessage | Offset | Candidate | Event]:
     """Yield the messages of the last day in a machine's recordings; unreadable files are skipped.
 
     The file that is being written is read up to its present end.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, WatchedMachine
-from compensator.watch.words import TONES
+from compensator.watch.words import CONFIG, TONES
 
 #: Largest number of machines; messages of further machines are only counted.
 MACHINES = 1000
@@ -32,8 +32,8 @@ class Shop:
     (1, 'unknown')
     """
 
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, clock: Clock, config_of: Mapping[str, str] | None = None) -> None:
+        self._clock, self._config_of = clock, config_of or {}
         self._lock = threading.Lock()
         self._machines: dict[str, WatchedMachine] = {}
         #: Number of messages with unknown keys, or of machines beyond `MACHINES`.
@@ -83,7 +83,7 @@ class Shop:
     def _machine(self, prefix: str) -> WatchedMachine | None:
         machine = self._machines.get(prefix)
         if machine is None and prefix and len(self._machines) < MACHINES:
-            machine = self._machines[prefix] = WatchedMachine(prefix)
+            machine = self._machines[prefix] = WatchedMachine(prefix, self._config_of.get(prefix, CONFIG))
         return machine
 
     # ------------------------------------------------------------------ views

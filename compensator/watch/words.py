@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +12,8 @@ from compensator.messages import Event
 from compensator.report.local_time import here
 from compensator.report.notation import plain
 
+#: Configuration file in commands where the watch was given none.
+CONFIG = "machine.toml"
 Tone = Literal["good", "warn", "bad"]
 
 #: Severity of each state, the worst first.
@@ -85,8 +88,8 @@ def explained_together(codes: Sequence[str]) -> list[ExplainedCode]:
     return [one._replace(do=SEVERAL_SUSPECTS) if one.code in suspects else one for one in found]
 
 
-def to_do(event: Event) -> str:
-    """Return the action for an event; empty if none is needed."""
+def to_do(event: Event, config: str = CONFIG) -> str:
+    """Return the action for an event, with the configuration file that its commands need; empty if none is needed."""
     if event.kind in (EventKind.DEVICE, EventKind.ADOPT) and event.data.get("ok") is not False:
         return ""
     if event.kind == EventKind.PROBE:
@@ -102,7 +105,8 @@ def to_do(event: Event) -> str:
     if event.kind == EventKind.DIAGNOSIS:
         return str(event.data.get("needs", ""))
     if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
-        return f"Answer with `{LOOP_COMMANDS[0]}` or `{LOOP_COMMANDS[1]}`."
+        yes, no = loop_commands(config)
+        return f"Answer with `{yes}` or `{no}`."
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""
@@ -129,8 +133,16 @@ def probe_text(probe: dict[str, Any]) -> str:
     return f"No probe wanted ({figures}). {PROBE_FOR}"
 
 
-#: What a person can answer to a candidate; the first is the yes.
-LOOP_COMMANDS = ("compensator adopt --candidate --config machine.toml", "compensator dismiss --config machine.toml")
+def loop_commands(config: str = CONFIG) -> tuple[str, str]:
+    """Return what a person can answer to a candidate: yes and no.
+
+    Examples
+    --------
+    >>> loop_commands("vmc 07.toml")[1]
+    "compensator dismiss --config 'vmc 07.toml'"
+    """
+    file = shlex.quote(config)
+    return f"compensator adopt --candidate --config {file}", f"compensator dismiss --config {file}"
 
 
 def loop_text(loop: Mapping[str, Any]) -> str:

@@ -132,6 +132,9 @@ def test_without_the_service_a_worse_model_is_refused_and_stored_only_by_force(
     error = capsys.readouterr().err
     assert "clearly worse: last" in error and "µm rms, this one" in error and "--force" in error
     assert error.count("\n") == 1 and in_use(recorded, capsys) == configured
+    assert main(["adopt", str(model), "--config", str(recorded), "--json"]) == 1
+    refused = result(capsys)
+    assert not refused["ok"] and refused["comparison"]["verdict"] == "worse" and "clearly worse" in refused["text"]
     assert main(["adopt", str(model), "--config", str(recorded), "--force", "--json"]) == 0
     answer = result(capsys)
     assert answer["comparison"]["verdict"] == "worse" and answer["comparison"]["deviations"] < -10.0

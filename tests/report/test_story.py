@@ -10,11 +10,13 @@ from typing import Any
 import pytest
 
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
+from compensator.messages import Event
 from compensator.recording.reading import recordings
 from compensator.report.gathering import read_history
 from compensator.report.history import History
 from compensator.report.page import html_of
 from compensator.report.recordings import figures, page_of, verdict
+from compensator.report.story import Story, figures_of, in_words
 from tests.audit.made import MACHINE, Service, other_model, readings
 
 CANDIDATE, BEFORE = "c" * 64, "b" * 64
@@ -129,3 +131,15 @@ def test_recordings_without_such_events_have_no_story(tmp_path: Path) -> None:
     assert "The machine's models" not in html_of(page_of(plain))
     assert "Models:" not in verdict(plain)
     assert "models_story" not in figures(plain)
+
+
+def test_a_candidate_that_is_proposed_again_is_one_proposal() -> None:
+    story = Story()
+    proposals = [(CANDIDATE, LoopAction.PROPOSE), (CANDIDATE, LoopAction.WITHDRAW)] * 2 + [
+        ("d" * 64, LoopAction.PROPOSE)
+    ]
+    for number, (sha256, step) in enumerate(proposals):
+        data = LoopData(step=step, model_sha256=sha256).table()
+        story.add(Event(schema=1, machine="m", seq=number, time_utc_ns=number, kind="loop", text=step, data=data))
+    counted = figures_of(story)["models_story"]
+    assert isinstance(counted, dict) and counted["proposed"] == 2 and "2 proposed" in in_words(story)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from compensator.arrays import Vector
 from compensator.config import Config
 from compensator.events import Note
 from compensator.messages import Sample
@@ -48,15 +49,26 @@ def stronger(change: float) -> bytes:
     return _with(effect_from("gain", {"path": "DTF", "change": change}))
 
 
-def _with(effect: Effect) -> bytes:
+def together(*models: bytes) -> bytes:
+    """The published model with the effects of several others."""
+    return _with(*(effect for model in models for effect in parse_model(model, source="test").effects))
+
+
+def _with(*effects: Effect) -> bytes:
     model = parse_model(QUILL_FILE, source="test")
-    return dump_model(dataclasses.replace(model, effects=(effect,), provenance={})).encode()
+    return dump_model(dataclasses.replace(model, effects=effects, provenance={})).encode()
 
 
 def shown(model: bytes | None, verdict: str = "explained") -> Diagnosed:
     """A diagnosis that has found a model."""
     effects = tuple(effect_names(parse_model(model, source="test"))) if model is not None else ()
     return Diagnosed(verdict, effects, model, "a diagnosis", needs="")
+
+
+def heat_w(samples: int) -> Vector:
+    """Heat of the machine's work, W."""
+    t = np.arange(samples)
+    return np.asarray(np.where((t // 60) % 3 == 1, 80.0, 0.0) * (0.5 + 0.5 * ((t // 180) % 2)))
 
 
 def machine(
@@ -71,8 +83,7 @@ def machine(
     """Samples of a working machine whose coolant acts on Y by 3 µm/K, as much as `acts` says."""
     rng = np.random.default_rng(seed)
     assert QUILL.ttf is not None and QUILL.tdtf is not None
-    t = np.arange(samples)
-    heat = np.where((t // 60) % 3 == 1, 80.0, 0.0) * (0.5 + 0.5 * ((t // 180) % 2))
+    t, heat = np.arange(samples), heat_w(samples)
     at = 20.0 + 0.8 * np.sin(t / 200.0)
     t_q = at + QUILL.ttf.sampled.response(heat) + 0.02 * rng.normal(size=samples)
     coolant = 22.0 + 1.5 * np.sin(t / 90.0) + 0.8 * np.sin(t / 37.0)

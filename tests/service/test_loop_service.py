@@ -20,7 +20,7 @@ from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit
 from compensator.clock import NS
 from compensator.config import parse_config
-from compensator.messages import Candidate
+from compensator.messages import Candidate, Event
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.loop.loop import StartDiagnosis
@@ -31,6 +31,8 @@ from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import model_store
 from compensator.service.transfer.model_store import sha256_of
+from compensator.watch.history import STEP_NS, MachineHistory
+from compensator.watch.past import last_day
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE, Machine, largest_step
 from tests.service.looping import extended, shown
@@ -204,9 +206,25 @@ async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_p
     yes = machine.at_sample[len(machine.outcomes) + 30] = Asked(machine, "adopt", candidate=True)
     await machine.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     assert yes.answer["ok"] and "µm rms, this one" in yes.answer["text"], yes.answer
+    # As `adopt FILE` answers: with the comparison, and by how much the offset moves.
+    assert "is adopted; " in yes.answer["text"] and "the offset would move by" in yes.answer["text"]
+    expected = machine.events("adopt")[-1].data["difference_um"]
+    assert yes.answer["comparison"]["offset_change_um"] == pytest.approx(expected, abs=0.5)
+    assert yes.answer["comparison"]["verdict"] == "better" and yes.answer["model_sha256"] == sha256_of(extended())
     assert machine.store.in_use() == extended() and machine.store.calibrated() == QUILL
     await machine.run(30)
     checked(machine)
+    # A page that is opened now has the candidate's prediction of the hours before, from the recordings.
+    seen = MachineHistory()
+    for message in last_day(machine.recordings, MACHINE, machine.clock.utc_ns()):
+        if isinstance(message, Candidate):
+            seen.add_recorded_candidate(message)
+        elif not isinstance(message, Event):
+            seen.add(message)
+    found = machine.candidates()
+    drawn = [value for value in seen.columns()["candidate_um"] if value is not None]
+    assert len(drawn) == len({one.time_utc_ns // STEP_NS for one in found}) > 300
+    assert drawn[0] == pytest.approx(found[0].y_pred_um, abs=1e-3)
 
 
 async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(tmp_path: Path) -> None:
@@ -414,3 +432,10 @@ async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp
         (folder / "model.toml").read_bytes()
     )
     checked(machine)
+
+
+async def test_a_loop_that_is_off_says_what_to_set(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()), policy="off")
+    no = machine.at_sample[5] = Asked(machine, "dismiss")
+    await machine.run(10)
+    assert not no.answer["ok"] and 'policy = "propose" or "adopt"' in no.answer["text"], no.answer

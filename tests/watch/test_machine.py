@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from compensator.clock import NS
-from compensator.messages import EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import AxesEstimate
 from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
@@ -338,12 +338,62 @@ def test_a_proposed_model_is_shown_with_its_figures_and_what_a_person_can_answer
     assert "one that has shown itself better is proposed, with input:coolant_degc" in found["line"]
     assert "present 6.9 µm rms, this one 1.2" in found["line"]
     assert [command.split()[1] for command in found["commands"]] == ["adopt", "dismiss"]
+    assert all(command.endswith("--config machine.toml") for command in found["commands"])
     assert "goes on" not in found["line"]
     beside = LOOP | {"before_effects": ["gain:DTF"], "before_text": "no verdict: no zero was set yet"}
     heard.hear(status=status(7, START_NS + 120 * NS, loop=beside))
     assert "The one before the last change (gain:DTF) goes on, too: no verdict" in heard.machine["loop"]["line"]
     heard.clock.advance(600)  # an old status says nothing about now
     assert "loop" not in heard.machine
+
+
+def test_a_candidate_that_is_not_proposed_yet_is_nothing_to_answer(heard: Heard) -> None:
+    heard.hear(offset=offset(5), estimate=estimate(5, y_pred_um=14.34))
+    heard.hear(status=status(5, loop=LOOP | {"phase": "shadow"}))
+    assert heard.machine["loop"]["commands"] == [] and "runs beside" in heard.machine["loop"]["line"]
+
+
+def test_the_commands_name_the_configuration_that_the_watch_was_given() -> None:
+    shop = Shop(Clock(), {"shop/vmc-01": "/etc/vmc 01.toml"})
+    for name in ("vmc-01", "vmc-02"):
+        shop.receive(f"shop/{name}/thermal/y/offset", offset(3, machine=name))
+        shop.receive(f"shop/{name}/thermal/status", status(3, machine=name, loop=LOOP))
+        proposed = {"schema": 1, "machine": name, "seq": 3, "time_utc_ns": START_NS, "kind": "loop", "text": "proposed"}
+        shop.receive(f"shop/{name}/thermal/event", json.dumps(proposed | {"data": {"step": "propose"}}).encode())
+    for name, file in (("vmc-01", "'/etc/vmc 01.toml'"), ("vmc-02", "machine.toml")):
+        found = shop.one(f"shop/{name}")
+        assert found is not None
+        assert [command.partition(" --config ")[2] for command in found["loop"]["commands"]] == [file] * 2
+        assert f"dismiss --config {file}`" in found["events"][0]["do"]
+
+
+def test_of_two_recorded_models_in_shadow_the_candidate_is_drawn() -> None:
+    history = MachineHistory()
+    history.add(msgspec.json.decode(estimate(5), type=EstimateMessage))
+    for role, y_um in (("before", 1.0), ("candidate", 2.0), ("before", 3.0)):
+        history.add_recorded_candidate(
+            Candidate(
+                schema=1,
+                machine="vmc-07",
+                seq=5,
+                time_utc_ns=START_NS,
+                model_sha256=role,
+                role=role,  # type: ignore[arg-type]
+                y_pred_um=y_um,
+                y_std_um=0.4,
+                residual_um=None,
+                present_residual_um=None,
+                innovations_um=[],
+                reasons=[],
+                verdict="alike",
+                present_rms_um=None,
+                candidate_rms_um=None,
+                deviations=None,
+                hours=0.0,
+                probes=0,
+            )
+        )
+    assert history.columns()["candidate_um"] == [2.0]
 
 
 def test_the_prediction_of_the_shadow_is_in_the_history_of_its_sample() -> None:

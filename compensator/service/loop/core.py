@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,12 +16,12 @@ from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
 from compensator.messages import Candidate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
+from compensator.service.loop.newcomer import Newcomer
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
 from compensator.service.loop.state import LoopState, PlaceName, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
-from compensator.service.status import Zero
+from compensator.service.status import Handover, Zero
 from compensator.service.transfer.second_opinion import described
 
 #: Attachments of a recording: state of the loop, and model file and state of each shadow, by place.
@@ -149,13 +150,38 @@ class ModelLoop:
         """Decide what follows from a diagnosis."""
         return self.loop.receive(found, now_ns)
 
+    def prefer(self, newcomer: Newcomer) -> list[Note]:
+        """Decide whether what a diagnosis has found takes the place of a proposed candidate, once it is warmed up."""
+        proposed, settings = self.state.proposed, self._config.loop
+        if proposed is None or settings is None or not self.loop.is_contested:
+            return []
+        return self.loop.prefer(newcomer.beside(proposed, settings))
+
+    @property
+    def is_free(self) -> bool:
+        """Whether a candidate that is warmed up gets its place."""
+        state = self.state
+        return state.diagnosis is not None and not state.exchange and not self.loop.is_contested
+
     def begin_shadow(
-        self, compensation: Compensation, data: bytes, now_ns: int, role: Role, error: ErrorBlocks
+        self, compensation: Compensation, data: bytes, now_ns: int, role: Role, newcomer: Newcomer
     ) -> None:
-        """Begin to compare what a diagnosis has found, in its state after the last sample, with its error on record."""
+        """Begin to compare what a diagnosis has found, in its state after the last sample."""
         model = compensation.model
         self.shadows["found"] = Shadow(compensation, data)
-        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
+        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=newcomer.error)
+
+    def offset_change_um(self, present: Compensation) -> float | None:
+        """Return by how much the offset would move if the candidate was adopted now, µm; None if that is unknown."""
+        shadow, candidate = self.shadows.get("found"), self.state.candidate
+        if shadow is None or candidate is None:
+            return None
+        new = Compensation(self._config, shadow.compensation.model)
+        new.restore(shadow.compensation.state())
+        new.raise_level(self.loop.level_at_adoption_um(candidate))
+        new.continue_from(_handed_over(present))
+        difference = new.status.target_um - present.status.target_um
+        return difference if math.isfinite(difference) else None
 
     def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes, Note]:
         """Let a model in shadow continue from the present one; that goes into shadow, or ends after a way back.
@@ -180,7 +206,7 @@ class ModelLoop:
         new = self.shadows.pop(state.incoming)
         handover = present.status.handover
         new.compensation.raise_level(level_um)
-        new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
+        new.compensation.continue_from(_handed_over(present))
         outgoing = self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
         # What holds the published offset concerns the new one only.
@@ -197,6 +223,11 @@ class ModelLoop:
         for name in ended:
             del self.shadows[name]
         return bool(ended)
+
+
+def _handed_over(present: Compensation) -> Handover:
+    """Return what another model continues from."""
+    return replace(present.status.handover, model_changed=present.status.zero is not None)
 
 
 def _exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData, level_um: float) -> Note:
@@ -226,7 +257,7 @@ def warmed_on(
     model: ThermalModel,
     record: Sequence[Outcome],
     at_rest: Outcome | None = None,
-    error: ErrorBlocks | None = None,
+    newcomer: Newcomer | None = None,
 ) -> Compensation:
     """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
 
@@ -238,8 +269,8 @@ def warmed_on(
         Outcomes in order; what is missing between two of them is a pause.
     at_rest : Outcome, optional
         That of the last zero at rest before the record.
-    error : ErrorBlocks, optional
-        Gets its error on the record.
+    newcomer : Newcomer, optional
+        Gets its outcomes.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
@@ -257,8 +288,8 @@ def warmed_on(
             apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
             compensation.pause(round(apart) - 1)
         _, other = shadow.process(outcome)
-        if error is not None:
-            error.update(other)
+        if newcomer is not None:
+            newcomer.update(other)
         last = outcome
     return compensation
 

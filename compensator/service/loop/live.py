@@ -15,20 +15,22 @@ from pathlib import Path
 from compensator.clock import NS, Clock
 from compensator.config import Config
 from compensator.errors import CompensatorError, ServiceError
-from compensator.events import EventKind, LoopAction, LoopData, Note
+from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.messages import Candidate, LoopStatus
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop
-from compensator.service.loop.level import ErrorBlocks
+from compensator.service.loop.newcomer import Newcomer
 from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.status import loop_status
 from compensator.service.loop.weighing import Weighed, effect_names
+from compensator.service.loop.words import named
 from compensator.service.transfer.candidate import warm_up
+from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.second_opinion import described
 from compensator.service.transfer.turns import give_way
@@ -38,14 +40,37 @@ log = logging.getLogger("compensator")
 
 @dataclass(slots=True)
 class _Found:
-    """A diagnosis that has ended; and its candidate's compensation once it is warmed up, with its error meanwhile."""
+    """A diagnosis that has ended; and its candidate once it is warmed up, with what it shows on the record."""
 
     weighed: Weighed
     text: str
-    compensation: Compensation | None = None
-    error: ErrorBlocks = field(default_factory=ErrorBlocks)
+    warmed: tuple[Compensation, Newcomer] | None = None
     since: list[Outcome] = field(default_factory=list)
     why: str = ""
+
+    def catch_up(self) -> tuple[Compensation, Newcomer]:
+        """Return the candidate, which is warmed up, in its state after the last sample."""
+        assert self.warmed is not None
+        compensation, newcomer = self.warmed
+        shadow = Shadow(compensation, b"")
+        for outcome in self.since:
+            missing = outcome.sample.seq - compensation.status.seq - 1
+            if missing < 0:
+                continue
+            if compensation.status.seq >= 0:
+                compensation.pause(missing)
+            newcomer.update(shadow.process(outcome)[1])
+        self.since.clear()
+        return compensation, newcomer
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A candidate for an operator to adopt: its hash, its name with its effects, and its comparison."""
+
+    sha256: str
+    named: str
+    comparison: ComparisonData
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,9 +158,8 @@ class LiveLoop:
         if core.drop_ended():
             self._journal.start_new_file()
         warmed = self._warming
-        is_wanted = core.state.diagnosis is not None and not core.state.exchange
-        if is_wanted and warmed is not None and warmed.compensation is not None:
-            self._begin_shadow(core, warmed, warmed.compensation)
+        if warmed is not None and warmed.warmed is not None and core.is_free:
+            self._begin_shadow(core, warmed)
         if not (core.state.exchange and self._stored):
             return present
         self._stored = False
@@ -145,19 +169,12 @@ class LiveLoop:
         self._events.note(*note)
         return new
 
-    def _begin_shadow(self, core: ModelLoop, warmed: _Found, compensation: Compensation) -> None:
+    def _begin_shadow(self, core: ModelLoop, warmed: _Found) -> None:
         self._warming = None
         assert warmed.weighed.candidate is not None
-        shadow = Shadow(compensation, warmed.weighed.candidate)
-        for outcome in warmed.since:
-            missing = outcome.sample.seq - compensation.status.seq - 1
-            if missing < 0:
-                continue
-            if compensation.status.seq >= 0:
-                compensation.pause(missing)
-            warmed.error.update(shadow.process(outcome)[1])
+        compensation, newcomer = warmed.catch_up()
         role, now_ns = role_of(warmed.weighed.data), compensation.status.time_utc_ns
-        core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, warmed.error)
+        core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, newcomer)
         self._journal.start_new_file()
 
     def hand_over(self, present: Compensation) -> None:
@@ -174,6 +191,8 @@ class LiveLoop:
                 self._task = asyncio.create_task(self._warm_up(found, found.weighed.candidate))
         if self._warming is not None and self._warming.why:
             self._end_one(core, "", self._warming.why)
+        if self._warming is not None and self._warming.warmed is not None and core.loop.is_contested:
+            self._note(core.prefer(self._warming.catch_up()[1]))
         if self._not_stored:
             self._end_not_stored(core)
 
@@ -195,8 +214,8 @@ class LiveLoop:
             except ServiceError as error:  # it has ended since the command was received
                 log.info("%s", error)
 
-    def offer(self, *, force: bool) -> str:
-        """Return what an operator would adopt, in words.
+    def offer(self, present: Compensation, *, force: bool) -> Offer:
+        """Return what an operator would adopt, and by how much the offset would move.
 
         Raises
         ------
@@ -207,12 +226,14 @@ class LiveLoop:
         candidate = state.candidate if state is not None and not state.exchange else None
         if candidate is None:
             raise ServiceError("there is no candidate now; see `compensator watch`")
-        words = f"{candidate.sha256[:12]} ({', '.join(candidate.effects) or 'no added effect'})"
+        words = f"{candidate.sha256[:12]} ({named(candidate.effects)})"
         if not candidate.is_proposed and not force:
             raise ServiceError(
                 f"candidate {words} is not proposed yet: {described(candidate.verdict)}; wait, or use --force"
             )
-        return f"candidate {words} is adopted; {described(candidate.verdict)}"
+        assert self._core is not None
+        moves_um = self._core.offset_change_um(present)
+        return Offer(candidate.sha256, words, changed(candidate.verdict, offset_change_um=moves_um))
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""
@@ -307,15 +328,16 @@ class LiveLoop:
         self._found, self._task = _Found(weighed.lasting(seconds), found.text), None
 
     async def _warm_up(self, found: _Found, data: bytes) -> None:
-        def warmed() -> Compensation:
+        def warmed() -> tuple[Compensation, Newcomer]:
             model = model_of(self._config, data, source="candidate")
-            way, seen = give_way(), found.error.update
-            return warm_up(
-                self._recordings, self._config, model, between_samples=way, probes=True, seen=seen
-            ).compensation
+            way, newcomer = give_way(), Newcomer(model.period_s)
+            ready = warm_up(
+                self._recordings, self._config, model, between_samples=way, probes=True, seen=newcomer.update
+            )
+            return ready.compensation, newcomer
 
         try:
-            found.compensation = await asyncio.to_thread(warmed)
+            found.warmed = await asyncio.to_thread(warmed)
         except CompensatorError as error:
             found.why = f"the candidate cannot be warmed up: {error}"
         self._task = None

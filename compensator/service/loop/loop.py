@@ -18,7 +18,7 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
@@ -31,18 +31,21 @@ from compensator.service.loop.place import (
     takes_over,
     why_nothing,
 )
-from compensator.service.loop.proof import is_limited
+from compensator.service.loop.proof import is_clearly_better, is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Exchange, LoopState, Place, PlaceName
 from compensator.service.loop.trust import all_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
-from compensator.service.loop.words import ended, nothing_follows
+from compensator.service.loop.words import begins, ended, named, nothing_follows, replaced
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN, Comparison
 from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
+#: Why a newcomer gets the place of a proposed candidate, does not get it, or waits for a person's answer; each with its
+#: comparison with the proposed one.
+BESIDE_PROPOSED = ("replaced", "shown_less", "waits")
 _HOUR_NS = 3600 * NS
 
 
@@ -127,7 +130,7 @@ class Loop:
                     notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
             else:
                 judge = compared.add(present, others[name])
-            if not state.exchange:
+            if not state.exchange and not (name == "found" and state.is_replaced):
                 notes += self._decide(name, place, now_ns, present, others[name], judge=judge)
         return notes + self._schedule(now_ns)
 
@@ -186,9 +189,13 @@ class Loop:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [self._note(place, LoopAction.PROPOSE, text)]
 
-    def _withdraw(self, place: Place, why: str) -> list[Note]:
+    def _withdraw(
+        self, place: Place, text: str, *, why: str = "", comparison: ComparisonData | None = None
+    ) -> list[Note]:
+        then = self._begins() if self.is_contested or self.state.is_replaced else []
         place.is_proposed = False
-        return [self._note(place, LoopAction.WITHDRAW, f"the proposal is withdrawn: {why}")]
+        text = f"the proposal is withdrawn: {text}"
+        return [self._note(place, LoopAction.WITHDRAW, text, why=why, comparison=comparison), *then]
 
     def _go_back(self, name: PlaceName, place: Place) -> list[Note]:
         self._exchange("back", name, place)
@@ -198,25 +205,35 @@ class Loop:
     def _exchange(self, action: Exchange, name: PlaceName, place: Place) -> None:
         """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
         state, compared = self.state, self._compared(place)
-        known_um = compared.level_um if action == "adopt" else None
         state.exchange, state.incoming = action, name
-        state.level_um = known_um if known_um is not None else compared.unknown_level_um
+        state.level_um = self.level_at_adoption_um(place) if action == "adopt" else compared.unknown_level_um
         if action == "adopt" and compared.shown_level_um is not None:
             place.verdict = msgspec.structs.replace(place.verdict, y_moved=False)  # the effect has moved it
+
+    def level_at_adoption_um(self, place: Place) -> float:
+        """Return by how much the level of a candidate is raised if it is adopted now, µm."""
+        compared = self._compared(place)
+        known_um = compared.level_um
+        return known_um if known_um is not None else compared.unknown_level_um
 
     def _end(self, name: PlaceName, why: str, text: str = "") -> list[Note]:
         """End a shadow, and an exchange with it."""
         state, place = self.state, self.state.place(name)
         if place is None:
             return []
-        note = self._note(place, LoopAction.END, text or ended(why, place.verdict), why=why)
+        is_contested = self.is_contested and place is state.proposed
+        notes = [self._note(place, LoopAction.END, text or ended(why, place.verdict), why=why)]
+        if is_contested:
+            notes += self._begins()
         place.begin_anew()
         state.put(name, None)
         if state.incoming == name:
             state.exchange = ""
-        return [note]
+        return notes
 
-    def _note(self, place: Place, step: LoopAction, text: str, why: str = "") -> Note:
+    def _note(
+        self, place: Place, step: LoopAction, text: str, why: str = "", comparison: ComparisonData | None = None
+    ) -> Note:
         data = LoopData(
             step=step,
             why=why,
@@ -224,7 +241,7 @@ class Loop:
             model_sha256=place.sha256,
             effects=place.effects,
             since_utc_ns=place.since_utc_ns,
-            comparison=place.verdict,
+            comparison=comparison if comparison is not None else place.verdict,
             level_um=self.state.level_um if self.state.exchange else None,
         )
         return Note(EventKind.LOOP, text, data.table())
@@ -247,20 +264,44 @@ class Loop:
             return []
         why = why_nothing(state, self._settings, found, now_ns)
         if why:
-            data = LoopData(
-                step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256
-            )
-            return [Note(EventKind.LOOP, nothing_follows(why, found), data.table())]
-        state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256)
-        text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
-        role = role_of(found)
-        if role == "before":
-            found_again = "nothing is found that the calibrated model lacks"
-            if found.verdict != "adequate":
-                found_again = f"the effects of the present model are not found again ({found.verdict})"
-            text = f"{found_again}: the calibrated model is compared with the present one"
-        data = LoopData(step=LoopAction.SHADOW, role=role, model_sha256=found.candidate_sha256, effects=found.effects)
-        return [Note(EventKind.LOOP, text, data.table())]
+            return [nothing_follows(why, found)]
+        state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
+        return [] if self.is_contested else self._begins()
+
+    def _begins(self) -> list[Note]:
+        """Say what begins to run in shadow once it is warmed up."""
+        running = self.state.diagnosis
+        return [begins(running.found)] if running is not None and running.found is not None else []
+
+    @property
+    def is_contested(self) -> bool:
+        """Whether what is warmed up must show itself beside a proposed candidate before it gets its place.
+
+        With the same effects it takes over what that one has shown, unless a person reads the proposal.
+        """
+        state, found = self.state, self.state.diagnosis.found if self.state.diagnosis is not None else None
+        if found is None or state.proposed is None or state.is_replaced:
+            return False
+        return self._settings.policy == "propose" or not takes_over(state, role_of(found), found.effects)
+
+    def prefer(self, beside: ComparisonData) -> list[Note]:
+        """Decide whether a candidate that is warmed up takes the place of the one that is proposed.
+
+        Parameters
+        ----------
+        beside : ComparisonData
+            It, compared with the proposed one as the present model (`Newcomer.beside`).
+        """
+        state, proposed, running = self.state, self.state.proposed, self.state.diagnosis
+        if proposed is None or running is None or running.found is None or not self.is_contested:
+            return []
+        found, is_asked = running.found, self._settings.policy == "propose"
+        if is_clearly_better(beside) and not is_asked:
+            state.diagnosis = msgspec.structs.replace(running, is_preferred=True)
+            return self._withdraw(proposed, replaced(found, beside), why=BESIDE_PROPOSED[0], comparison=beside)
+        state.diagnosis = None
+        # A person who reads a proposal must still find it when answering.
+        return [nothing_follows(BESIDE_PROPOSED[2 if is_asked else 1], found, beside)]
 
     # ------------------------------------------------------------------ between two samples
 
@@ -373,4 +414,4 @@ class Loop:
 
 
 def _named(place: Place) -> str:
-    return f"{place.sha256[:12]} with {', '.join(place.effects) or 'no added effect'}"
+    return f"{place.sha256[:12]} with {named(place.effects)}"

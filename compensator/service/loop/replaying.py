@@ -10,6 +10,7 @@ from compensator.messages import Event
 from compensator.recording.container import Contents
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
+from compensator.service.loop.loop import BESIDE_PROPOSED
 from compensator.service.replay import RecordedStep, setup_of
 
 #: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
@@ -72,6 +73,9 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
         return core.receive(found, now_ns) if found is not None else []
     elif event.kind == EventKind.LOOP:
         data = data_of(event, LoopData)
+        if data is not None and data.comparison is not None and data.why in BESIDE_PROPOSED:
+            # How a newcomer compares with what is proposed comes from its warm-up: an input, as a diagnosis is.
+            return core.loop.prefer(data.comparison)
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
             core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
     return []

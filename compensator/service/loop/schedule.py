@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
@@ -49,7 +47,9 @@ def begin_again(state: LoopState) -> list[Note]:
         data = LoopData(step=LoopAction.END, why="interrupted")
         text = "a diagnosis was interrupted twice: the next one is made when it is planned"
         return [Note(EventKind.LOOP, text, data.table())]
-    state.diagnosis = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
+    state.diagnosis = Running(
+        from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why="again", attempts=running.attempts + 1
+    )
     return [_begins(state.diagnosis)]
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from compensator.errors import DataError
-from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
@@ -24,13 +24,18 @@ NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
-    """A diagnosis: what is diagnosed, why, how often it was begun, and whether its candidate is being warmed up."""
+    """A diagnosis: what is diagnosed, why, how often it was begun, and whether its candidate is being warmed up.
+
+    `found` is its result then. `is_preferred`: the candidate takes the place of a proposed one before the next sample.
+    """
 
     from_utc_ns: int
     to_utc_ns: int
     why: str
     attempts: int = 1
     candidate_sha256: str = ""
+    found: DiagnosisData | None = None
+    is_preferred: bool = False
 
 
 class Place(msgspec.Struct, kw_only=True):
@@ -149,6 +154,16 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         return self.found if self.found is not None and self.found.role == "candidate" else None
 
     @property
+    def proposed(self) -> Place | None:
+        """The candidate that is proposed, if there is one."""
+        return self.candidate if self.candidate is not None and self.candidate.is_proposed else None
+
+    @property
+    def is_replaced(self) -> bool:
+        """Whether the candidate gives its place to another one before the next sample."""
+        return self.diagnosis is not None and self.diagnosis.is_preferred
+
+    @property
     def shown(self) -> Place | None:
         """The model in shadow that concerns a person first: the candidate, or else a model that was in force."""
         return self.candidate or self.watched or self.found
@@ -157,7 +172,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def phase(self) -> Phase:
         """What a person may have to answer to."""
         if self.candidate is not None:
-            return "proposed" if self.candidate.is_proposed else "shadow"
+            return "proposed" if self.proposed is not None else "shadow"
         return "watching" if self.taken else "idle"
 
 

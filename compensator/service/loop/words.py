@@ -2,8 +2,48 @@
 
 from __future__ import annotations
 
-from compensator.events import ComparisonData, DiagnosisData
+from collections.abc import Sequence
+
+from compensator.events import ComparisonData, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.place import role_of
 from compensator.service.transfer.second_opinion import described
+
+
+def named(effects: Sequence[str]) -> str:
+    """Return the effects of a model in words."""
+    return ", ".join(effects) or "no added effect"
+
+
+def begins(found: DiagnosisData) -> Note:
+    """Say what of a diagnosis begins to run in shadow."""
+    text = f"a candidate is compared with the present model: {named(found.effects)}"
+    if found.calibrated:
+        found_again = "nothing is found that the calibrated model lacks"
+        if found.verdict != "adequate":
+            found_again = f"the effects of the present model are not found again ({found.verdict})"
+        text = f"{found_again}: the calibrated model is compared with the present one"
+    data = LoopData(
+        step=LoopAction.SHADOW, role=role_of(found), model_sha256=found.candidate_sha256, effects=found.effects
+    )
+    return Note(EventKind.LOOP, text, data.table())
+
+
+def replaced(newcomer: DiagnosisData, beside: ComparisonData) -> str:
+    """Return why a proposed candidate gives its place to a newcomer."""
+    return f"{named(newcomer.effects)} is clearly better; {_beside_proposed(beside)}"
+
+
+def _beside_proposed(found: ComparisonData | None) -> str:
+    """Return how a newcomer compares with the proposed candidate on the same hours."""
+    if found is None or found.present_rms_um is None or found.candidate_rms_um is None:
+        return "nothing was measured in the hours of both"
+    shown = "too little to judge"
+    if found.deviations is not None:
+        shown = f"by the changes of Y {found.deviations:+.1f} standard deviations for it"
+    return (
+        f"on the same {found.hours:.3g} h: proposed {found.present_rms_um:.1f} µm rms, "
+        f"this one {found.candidate_rms_um:.1f}; {shown}"
+    )
 
 
 def ended(why: str, verdict: ComparisonData) -> str:
@@ -18,9 +58,9 @@ def ended(why: str, verdict: ComparisonData) -> str:
     }[why]
 
 
-def nothing_follows(why: str, found: DiagnosisData) -> str:
-    """Return why nothing follows from a diagnosis."""
-    effects = ", ".join(found.effects) or "no added effect"
+def nothing_follows(why: str, found: DiagnosisData, beside: ComparisonData | None = None) -> Note:
+    """Say why nothing follows from a diagnosis, with its comparison with a proposed candidate if there is one."""
+    effects = named(found.effects)
     words = {
         "failed": f"the diagnosis failed: {found.needs}",
         "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
@@ -30,5 +70,13 @@ def nothing_follows(why: str, found: DiagnosisData) -> str:
         "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
         "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
         "waits": f"{effects}: waits while another model takes over, or is proposed; looked for again later",
+        "shown_less": f"{effects}: not clearly better than what is proposed, which stays; {_beside_proposed(beside)}",
     }
-    return words[why].rstrip("; ")
+    data = LoopData(
+        step=LoopAction.NOTHING,
+        why=why,
+        effects=found.effects,
+        model_sha256=found.candidate_sha256,
+        comparison=beside,
+    )
+    return Note(EventKind.LOOP, words[why].rstrip("; "), data.table())

@@ -114,7 +114,7 @@ def _described(found: ComparisonData) -> str:
     elif found.verdict == ComparisonVerdict.ALIKE or found.deviations is None:
         text += " (no clear difference)"
     else:
-        moved = "measured Y has moved by itself; by its changes, this one is " if found.y_moved else ""
+        moved = "about the zero it looks otherwise; by the changes of measured Y, this one is " if found.y_moved else ""
         refuted = "the present one" if found.verdict == ComparisonVerdict.BETTER else "it"
         text += f" ({moved}{found.verdict}: {refuted} is refuted by {abs(found.deviations):.0f} standard deviations)"
     return "; ".join(filter(None, (text, moves)))
