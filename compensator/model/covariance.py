@@ -14,8 +14,9 @@ of the design, of *P* before it and of these, in element-wise arithmetic of a fi
 the bit: a step that another observer has made has the bits that it would have here, whoever was first. What has been
 found is never changed; two threads that find the same step at once find the same. A process keeps 8 MB (`_KEPT_BYTES`)
 of steps, of all designs together. One that does not fit any more makes it forget all and begin again: until then a step
-is kept, whether or not its observer still is. About 1,000 steps lead from rest to the steady state, as many after a
-gap, and a settled observer adds none; 8 MB are 2,800 of them for `quill`, 1,470 for a machine of five parts.
+is kept, whether or not its observer still is. Some 1,000 samples lead from rest to the steady state, as many after a
+gap: a step each, and one more for each sample that T_Q is late. A settled observer adds none. 8 MB are 2,800 steps of
+`quill`, 1,470 of a machine of five parts.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
 """
