@@ -8,7 +8,7 @@ itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError
 from compensator.events import DiagnosisData
 from compensator.model.effects import Effect
+from compensator.model.effects.regression import Regression
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, model_of
 
@@ -115,8 +116,17 @@ def without_candidate(found: Diagnosed) -> DiagnosisData:
 
 
 def effect_names(model: ThermalModel) -> list[str]:
-    """Return the effects of a model, each by its kind and place."""
-    return [name_of(effect) for effect in model.effects]
+    """Return the effects that a model is known by, each by its kind and place."""
+    return [name_of(effect) for effect in _known_by(model)]
+
+
+def _known_by(model: ThermalModel) -> Sequence[Effect]:
+    """Return the effects with a name; without any, the remainder.
+
+    A remainder beside them is the base's own error: its channels differ from one diagnosis to the next, and what is
+    explained stays the same.
+    """
+    return [effect for effect in model.effects if effect.kind != Regression.kind] or model.effects
 
 
 def name_of(effect: Effect) -> str:
@@ -138,7 +148,7 @@ def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
     In standard errors of the first model, which was found later: it was found on more of the effect, and says whether
     the parameters of the other one are still possible. Infinite where an effect has none and the parameters differ.
     """
-    own, others = ({name_of(effect): effect for effect in one.effects} for one in (model, other))
+    own, others = ({name_of(effect): effect for effect in _known_by(one)} for one in (model, other))
     if own.keys() != others.keys():
         return False, math.inf
     return True, max((_change(effect, others[name]) for name, effect in own.items()), default=0.0)

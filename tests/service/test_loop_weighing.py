@@ -1,0 +1,44 @@
+"""What follows from the result of a diagnosis: whether it has found the same effects again, and how far they differ."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from compensator.model.effects import effect_from
+from compensator.model.model_file import load_model
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.loop.weighing import difference, effect_names
+
+
+def coolant(gain: float) -> tuple[str, dict[str, Any]]:
+    table = {"channel": "coolant_degc", "curve": "linear", "tau_min": [30.0], "gain": [gain], "delay_min": 0.0}
+    return "input", {**table, "std": {"gain": [0.1]}}
+
+
+def remainder(*channels: str) -> tuple[str, dict[str, Any]]:
+    gains = [[0.1 * number, 0.2] for number, _ in enumerate(channels, start=1)]
+    table = {"channels": list(channels), "exponents": [1.0] * len(channels), "taus_min": [0.0, 30.0], "gains": gains}
+    return "regression", table
+
+
+def extended(*effects: tuple[str, dict[str, Any]]) -> ThermalModel:
+    found = tuple(effect_from(kind, table) for kind, table in effects)
+    return dataclasses.replace(load_model("quill"), effects=found)
+
+
+def test_the_own_error_beside_a_named_effect_makes_no_other_explanation_of_it() -> None:
+    first = extended(coolant(2.0), remainder("heat_w", "floor_degc"))
+    again = extended(coolant(2.3), remainder("heat_w", "coolant_degc", "at_degc"))
+    assert effect_names(first) == effect_names(again) == ["input:coolant_degc"]
+    same, deviations = difference(again, first)
+    assert same and math.isclose(deviations, 3.0)
+    assert difference(extended(coolant(2.0)), first) == (True, 0.0)
+
+
+def test_a_remainder_alone_is_told_by_its_channels() -> None:
+    first, again = extended(remainder("heat_w", "floor_degc")), extended(remainder("heat_w", "coolant_degc"))
+    assert effect_names(first) == ["regression:heat_w+floor_degc"]
+    assert difference(again, first) == (False, math.inf)
+    assert not difference(extended(coolant(2.0)), first)[0]
