@@ -144,7 +144,7 @@ def audit(
     Raises
     ------
     DataError
-        If a file is not a recording, or there is none but what is no file.
+        If a file is not a recording, or none of them is a file.
     UsageError
         If the key or the head cannot be used.
     """

@@ -347,7 +347,7 @@ class Covariance:
             If it is of another size.
         """
         if len(upper_triangle) != self._upper.size:
-            raise ValueError(f"covariance of {len(upper_triangle)} numbers, the model has {self._upper.size}")
+            raise ValueError(f"snapshot of {len(upper_triangle)} covariances, the model has {self._upper.size}")
         p = np.zeros((self.size, self.size))
         flat = p.reshape(-1)
         flat[self._upper] = flat[self._lower] = upper_triangle

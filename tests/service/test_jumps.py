@@ -412,6 +412,39 @@ def test_a_loose_contact_that_comes_to_rest_is_used_again_and_unconfirmed(
     assert resumed[-1].offset.state == "ok"
 
 
+@pytest.mark.parametrize("size", [8.0, -8.0])
+def test_a_loose_contact_of_the_air_that_rests_where_no_air_can_be_is_not_used(
+    day: dict[str, np.ndarray], size: float
+) -> None:
+    """And where it then comes near its level for some samples, that is no return."""
+    jumps = (0.0, 1.0, 0.6, 1.0, 0.7, 1.0, 0.0, 1.3)
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if 200 <= i < 600:
+            by = jumps[(i - 200) // 2] if i < 212 else 1.0
+            values["at_degc"] += size * (0.15 if i >= 300 and (i // 6) % 2 == 0 else by)
+
+    outcomes = run(day, change)
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    states = [str(o.offset.state) for o in outcomes]
+    assert set(states[230:600]) == {"hold"} and not events(outcomes, "unconfirmed")
+    assert not any(far > 5.0 and state == "ok" for far, state in zip(apart, states, strict=True))
+
+
+def test_a_loose_contact_that_jumps_across_missing_samples_is_not_at_rest(day: dict[str, np.ndarray]) -> None:
+    jumps = (0.0, 1.0, 0.6, 1.0, 0.7, 1.0)
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if 200 <= i < 212:
+            values["at_degc"] += 6.0 * jumps[(i - 200) // 2]
+        elif 212 <= i < 500:
+            values["at_degc"] += 1.9 * ((i // 4) % 2) - 0.95
+            if i % 2:
+                values["at_degc"] = math.nan
+
+    assert not [i for i in events(run(day, change), "unconfirmed") if i < 500]
+
+
 def test_a_direct_model_keeps_a_suspect_until_an_operator_decides(day: dict[str, np.ndarray]) -> None:
     outcomes = run(day, biased("t_q_degc", 8.0), model=direct("kalman"))
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN:END])

@@ -110,6 +110,20 @@ def test_a_kill_before_a_newcomer_is_weighed_changes_nothing() -> None:
     assert about(steps) == [("nothing", "shown_less")]
 
 
+async def test_a_newcomer_that_has_shown_less_is_forgotten_when_the_next_diagnosis_begins(tmp_path: Path) -> None:
+    service = WarmAtFirst(
+        tmp_path, NOTHING, shown(extended()), shown(stronger(0.1)), NOTHING, acts=begun, before_night=8 * 60
+    )
+    service.use(service.config_bytes.replace(b"every_h = 24", b"every_h = 12"))
+    await service.run(2400, until=in_phase(service, "proposed"))
+    later = itertools.count()
+    await service.run(1700, until=lambda _: len(service.asked) == 4 and next(later) == 20)
+    steps = [step for step in service.steps() if step[0] != "diagnose"]
+    assert steps[steps.index(("propose", "")) + 1] == ("nothing", "shown_less")
+    assert sha256_of(stronger(0.1)) not in {one.model_sha256 for one in service.candidates()}
+    checked(service)
+
+
 @pytest.mark.parametrize(
     ("first", "second", "decided"),
     [

@@ -193,6 +193,8 @@ class LiveLoop:
             self._end_one(core, "", self._warming.why)
         if self._warming is not None and self._warming.warmed is not None and core.loop.is_contested:
             self._note(core.prefer(self._warming.catch_up()[1]))
+            if core.state.diagnosis is None:
+                self._warming = None  # it does not get the place
         if self._not_stored:
             self._end_not_stored(core)
 

@@ -280,7 +280,7 @@ class Loop:
         With the same effects it takes over what that one has shown, unless a person reads the proposal.
         """
         state, found = self.state, self.state.diagnosis.found if self.state.diagnosis is not None else None
-        if found is None or state.proposed is None or state.is_replaced:
+        if found is None or state.proposed is None or state.is_replaced or state.exchange:
             return False
         return self._settings.policy == "propose" or not takes_over(state, role_of(found), found.effects)
 

@@ -1,7 +1,8 @@
 """Which of the two places beside the present model a model gets, and what follows from a diagnosis.
 
-What a diagnosis finds gives its place to what a later one finds, which knows more. The model before an adoption has a
-place of its own for as long as it is watched: the way back does not depend on what is found meanwhile.
+What a diagnosis finds gives its place to what a later one finds, which knows more, but for a proposal (`newcomer`).
+The model before an adoption has a place of its own for as long as it is watched: the way back does not depend on what
+is found meanwhile.
 """
 
 from __future__ import annotations

@@ -170,6 +170,16 @@ class JumpEngines:
                 return False
         return True
 
+    def may_be(self, state: JumpState, offered: Mapping[str, float]) -> bool:
+        """Return whether none is missing, and those that have jumped are where the shifted engine expects them."""
+        if any(map(math.isnan, offered.values())):
+            return False
+        for name in state.shifts_k:
+            expected, std = expected_value(self.shifted.engine, name, offered["at_degc"])
+            if abs(offered[name] - expected) > NEAR * std:
+                return False
+        return True
+
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
         if is_unsteady(state):

@@ -25,9 +25,10 @@ a channel that then reads otherwise than expected is *unconfirmed*: heat or air 
 It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
 one of them.
 
-A loose contact jumps again and again: it has no level that the shifted engine could follow, which goes without it. Its
-expectation is soon too wide for a return to show. Once the channel has come to rest, for as long as it would have to be
-back, it is like a couple that was open: used again, and unconfirmed. The believing engine starts with its last jump.
+A loose contact jumps again and again: it has no level that the shifted engine could follow, which goes without it. Of
+T_Q its expectation is soon too wide for a return to show. Once the channel has come to rest, for as long as it would
+have to be back, and where the shifted engine thinks possible, it is like a couple that was open: used again, and
+unconfirmed. The believing engine starts with its last jump.
 
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
@@ -263,7 +264,7 @@ class JumpWatch:
         engines = self._engines
         if engines is None:
             return Judgement()
-        self._state.last = {name: offered[name] for name in TEMPERATURES if not math.isnan(offered[name])}
+        self._state.last |= {name: offered[name] for name in TEMPERATURES if not math.isnan(offered[name])}
         fed = engines.feed(self._state, offered, jumped, self._change_k)
         count_held(self._state, engine, offered["at_degc"])
         if fed.jumped and self._state.is_suspect:
@@ -330,6 +331,7 @@ class JumpWatch:
             # What goes on from sample to sample is one jump, or heat.
             state.samples = 0
             return []
+        state.at_held = 0
         engines.believe_as_shifted()
         state.again += 1
         if state.is_suspect:
@@ -372,7 +374,7 @@ class JumpWatch:
         by = self._confirmed_by()
         if by:
             return self._accept(engine, offered, engines.believing, f"is used again: {by} with it")
-        if is_unsteady(state) and state.samples >= needed and not any(map(math.isnan, offered.values())):
+        if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
             return self._settle(engine, engines, offered)
         return Judgement()
 
