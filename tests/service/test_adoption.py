@@ -172,7 +172,7 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
 
     def slow(self: Adoption, *arguments: Any) -> Any:
         warmed = prepare(self, *arguments)
-        assert held.wait(30.0)
+        assert held.wait(120.0)
         return warmed
 
     monkeypatch.setattr(Adoption, "_candidate", slow)
@@ -366,7 +366,7 @@ async def test_a_model_that_takes_for_ever_does_not_keep_the_service_from_ending
         machine.promises.open.clear()  # simulated time does not wait for it
 
     machine.at_sample[20] = ask
-    machine.at_sample[22] = lambda: at_work.wait(20.0)
+    machine.at_sample[22] = lambda: at_work.wait(60.0)
     try:
         await machine.run(24)
         assert at_work.is_set()
