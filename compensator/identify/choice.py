@@ -166,11 +166,11 @@ def choose(
     """
     candidates: list[Candidate] = []
     fits: dict[Structure, OutputErrorFit] = {}
+    before = {known.structure: known} if known is not None else {}
     for done, structure in enumerate(structures):
         progress(done, len(structures))
         try:
-            is_known = known is not None and known.structure == structure
-            found = known if known is not None and is_known else tried(segments, structure, period_s, folds)
+            found = before.get(structure) or tried(segments, structure, period_s, folds)
         except DataError:
             continue
         candidates.append(_candidate(segments, found))

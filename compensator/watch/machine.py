@@ -349,9 +349,7 @@ class WatchedMachine:
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
             warnings=list(map(str, sorted(warnings, key=lambda one: one.code not in _SEVERE))),
-            is_proposed=status is not None
-            and not isinstance(status.loop, UnsetType)
-            and status.loop.phase == "proposed",
+            is_proposed=_is_proposed(status),
         )
 
     @staticmethod
@@ -375,7 +373,7 @@ class WatchedMachine:
         if status is None or isinstance(status.loop, UnsetType):
             return None
         found = msgspec.structs.asdict(status.loop)
-        commands = loop_commands(self.config) if status.loop.phase == "proposed" else ()
+        commands = loop_commands(self.config) if _is_proposed(status) else ()
         return found | {"line": loop_text(found), "commands": list(commands)}
 
     def _fresh(self, message: Any, now_ns: int) -> bool:
@@ -439,3 +437,8 @@ def _to_do(shown: str, reasons: list[ExplainedCode], warnings: list[Remark]) -> 
     if not asked and not (warnings and shown == State.OK):
         asked = [explained(shown).do]
     return " ".join(dict.fromkeys([*asked, *map(str, warnings)]))
+
+
+def _is_proposed(status: Status | None) -> bool:
+    """Return whether a candidate waits for a person's answer."""
+    return status is not None and not isinstance(status.loop, UnsetType) and status.loop.phase == "proposed"

@@ -110,12 +110,16 @@ def test_a_kill_before_a_newcomer_is_weighed_changes_nothing() -> None:
     assert about(steps) == [("nothing", "shown_less")]
 
 
-async def test_a_newcomer_that_has_shown_less_is_forgotten_when_the_next_diagnosis_begins(tmp_path: Path) -> None:
-    service = WarmAtFirst(
-        tmp_path, NOTHING, shown(extended()), shown(stronger(0.1)), NOTHING, acts=begun, before_night=8 * 60
-    )
+async def proposed(folder: Path, *found: Any) -> WarmAtFirst:
+    """A service that looks twice a day and finds this in turn, run until a candidate is proposed."""
+    service = WarmAtFirst(folder, *found, acts=begun, before_night=8 * 60)
     service.use(service.config_bytes.replace(b"every_h = 24", b"every_h = 12"))
     await service.run(2400, until=in_phase(service, "proposed"))
+    return service
+
+
+async def test_a_newcomer_that_has_shown_less_is_forgotten_when_the_next_diagnosis_begins(tmp_path: Path) -> None:
+    service = await proposed(tmp_path, NOTHING, shown(extended()), shown(stronger(0.1)), NOTHING)
     later = itertools.count()
     await service.run(1700, until=lambda _: len(service.asked) == 4 and next(later) == 20)
     steps = [step for step in service.steps() if step[0] != "diagnose"]
@@ -135,9 +139,7 @@ async def test_the_service_decides_by_what_was_warmed_up_and_a_replay_decides_it
     tmp_path: Path, first: list[bytes], second: bytes, decided: list[tuple[str, str]]
 ) -> None:
     found = [NOTHING, *map(shown, first), shown(second)]
-    service = WarmAtFirst(tmp_path, *found, acts=begun, before_night=8 * 60)
-    service.use(service.config_bytes.replace(b"every_h = 24", b"every_h = 12"))
-    await service.run(2400, until=in_phase(service, "proposed"))
+    service = await proposed(tmp_path, *found)
     assert len(service.asked) == 1 + len(first)
     later = itertools.count()
     await service.run(900, until=lambda _: len(service.asked) == len(found) and next(later) == 20)
