@@ -178,7 +178,13 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
     monkeypatch.setattr(Adoption, "_candidate", slow)
     asked = machine.at_sample[150] = Asked(machine, "adopt", payload(STRONGER))
     second = machine.at_sample[160] = Asked(machine, "back")
-    machine.at_sample[200] = held.set
+    machine.at_sample[165] = machine.promises.open.clear  # simulated time does not wait for what is held
+
+    def release() -> None:
+        held.set()
+        machine.promises.add(asked.reply)
+
+    machine.at_sample[200] = release
     await machine.run(500, adopted(STRONGER))
     assert asked.answer["ok"]
     assert not second.answer["ok"] and "another model is being prepared" in second.answer["text"]
