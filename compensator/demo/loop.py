@@ -69,7 +69,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> Loop:
     first_model, extended = folder / "calibration" / "model.toml", folder / "diagnosis" / "model.toml"
     found = diagnose_files(recordings, first_model, extended.parent).result
     # An unchanged model is not adopted.
-    adopt = extended if _dynamics(extended) != _dynamics(first_model) else None
+    adopt = extended if _content(extended) != _content(first_model) else None
     days = {
         name: run_day(
             folder / f"second-day-{name}",
@@ -98,12 +98,13 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> Loop:
         "explanation": [e["explanation"] for e in found["effects"]],
         "held_out_rms_um": {"before": found["before"]["rms_um"], "after": found["after"]["rms_um"]},
         "adopted": adopt is not None,
+        "offset_changes": _content(extended, y_std_um=1.0) != _content(first_model, y_std_um=1.0),
         "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
     }
     return Loop(figures=figures, second_day=curves, effect=effect, first_model=days["first"])
 
 
-def _dynamics(model: Path) -> str:
-    """Return the content of a model file without its provenance."""
-    return dump_model(dataclasses.replace(load_model(model), provenance={}))
+def _content(model: Path, **same: Any) -> str:
+    """Return the content of a model file without its provenance, with some fields replaced."""
+    return dump_model(dataclasses.replace(load_model(model), provenance={}, **same))

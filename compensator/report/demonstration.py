@@ -98,11 +98,12 @@ def closed(loop: Mapping[str, Any]) -> str:
     """
     rms = loop["second_day_rms_um"]
     left = f"An effect absent from the calibration leaves {rms['first']:.2f} µm rms"
-    if loop["adopted"]:
+    if loop["offset_changes"]:
         return f"{left}; with the effects that the diagnosis found in the recordings, {rms['extended']:.2f}."
     return (
         f"{left}; the effects that the diagnosis found in the recordings ({', '.join(loop['found']) or 'none'}) are "
-        "not deployable or do not reduce the error on held-out blocks, so the model was not changed."
+        "not deployable or do not reduce the error on held-out blocks, so the "
+        f"{'model changes its standard deviation only' if loop['adopted'] else 'model was not changed'}."
     )
 
 

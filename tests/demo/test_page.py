@@ -23,21 +23,25 @@ def words(loop: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize(
-    ("adopted", "there", "not_there"),
+    ("adopted", "offset_changes", "there", "not_there"),
     [
-        (True, "adopted the extended model; errors from 1.0 h on", "not changed"),
-        (False, "The model was not changed", "adopted the extended model"),
+        (True, True, "adopted the extended model; errors from 1.0 h on", "not changed"),
+        (True, False, "the model changes its standard deviation only", "found in the recordings, 1.2"),
+        (False, False, "The model was not changed", "adopted the extended model"),
     ],
 )
-def test_the_page_says_whether_a_model_was_taken_over(adopted: bool, there: str, not_there: str) -> None:
+def test_the_page_says_whether_a_model_was_taken_over(
+    adopted: bool, offset_changes: bool, there: str, not_there: str
+) -> None:
     loop = {
         "second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2 if adopted else 6.3},
         "found": ["drift"],
         "verdict": "partly_explained",
         "drawn": "drift",
         "adopted": adopted,
+        "offset_changes": offset_changes,
         "adopted_after_h": float(adopted),
     }
     page = words(loop)
     assert there in page and not_there not in page and "partly explained" in page
-    assert ("drift) are not deployable" in page) is not adopted
+    assert ("drift) are not deployable" in page) is not offset_changes

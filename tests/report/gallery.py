@@ -123,6 +123,7 @@ def _demo(path: Path) -> None:
         "verdict": "explained",
         "drawn": "hysteresis DTF",
         "adopted": True,
+        "offset_changes": True,
         "adopted_after_h": 1.0,
     }
     paper = [Row(path="TTF", figure="gain at rest, K/W", found=0.25, std=0.01, reference=0.25)]
