@@ -43,7 +43,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import msgspec
 
@@ -84,8 +83,7 @@ WATCHED_SAMPLES = 15
 _LEVEL = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(msgspec.Struct, frozen=True):
     """What a sample has shown.
 
     Parameters
@@ -99,8 +97,8 @@ class Judgement:
     """
 
     estimate: Estimate | None = None
-    notes: list[Note] = field(default_factory=list)
-    accepted: dict[str, float] = field(default_factory=dict)
+    notes: list[Note] = []
+    accepted: dict[str, float] = {}
 
 
 class JumpWatch:
