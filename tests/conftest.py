@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import pickle
@@ -61,7 +62,7 @@ def equal_pictures_once() -> Iterator[None]:
     from compensator.report.drawing import svg
 
     def once(figure: Any, prefix: str, width: float) -> str:
-        key = pickle.dumps((figure, prefix, width))
+        key = hashlib.sha256(pickle.dumps((figure, prefix, width))).digest()
         if key not in _drawn:
             _drawn[key] = svg(figure, prefix, width)
         return _drawn[key]
