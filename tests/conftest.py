@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
+import pickle
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -45,3 +48,25 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     For tests of figures and words that other tests have drawn: `report/` draws the page of every command.
     """
     monkeypatch.setattr("compensator.report.page.svg", lambda figure, prefix, width=0.0: f'<svg id="{prefix}"></svg>')
+
+
+_drawn: dict[bytes, str] = {}
+
+
+@pytest.fixture(scope="module")
+def equal_pictures_once() -> Iterator[None]:
+    """Draw figures that are equal to the bit once: for tests of what several ways to one page put into it.
+
+    That the same figure is drawn the same each time is for tests of `report/`.
+    """
+    from compensator.report.drawing import svg
+
+    def once(figure: Any, prefix: str, width: float) -> str:
+        key = hashlib.sha256(pickle.dumps((figure, prefix, width))).digest()
+        if key not in _drawn:
+            _drawn[key] = svg(figure, prefix, width)
+        return _drawn[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("compensator.report.page.svg", once)
+        yield

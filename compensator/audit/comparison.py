@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -285,7 +285,9 @@ class _Run:
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:
             return
         y_ref_um = math.nan if estimate.y_base_um != 0.0 else number(estimate.y_ref_um)
-        compensation.begin(replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0, further={}))
+        compensation.begin(
+            msgspec.structs.replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0, further={})
+        )
         figures = (
             f"{step.file}: starts while the machine is running, and the other model has no state except the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."

@@ -23,6 +23,7 @@ Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential upd
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Iterable
@@ -30,6 +31,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compensator.arrays import Matrix
 
@@ -152,8 +154,7 @@ class Covariance:
         self._key = sys.intern(repr(design))
         self.size = len(design.rows)
         self._drive, self._ambient = self.size - 2, self.size - 1
-        upper, right = np.triu_indices(self.size)
-        self._upper, self._lower = upper * self.size + right, right * self.size + upper
+        self._upper, self._lower = _triangles(self.size)
         next_row, first_row, source_row, a, b = (np.array(column) for column in zip(*design.rows, strict=True))
         self._gathered = np.array((next_row, first_row, source_row))
         self._factors = np.array((a, b))[:, :, None]
@@ -356,6 +357,13 @@ class Covariance:
         self.y_var = _variance(self._of_y, self.p.tolist())
         if settled:
             self._steady = self._steady_gains()
+
+
+@functools.cache
+def _triangles(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return where the upper triangle of a matrix is in its elements, row by row, and where its mirror image is."""
+    upper, right = np.triu_indices(size)
+    return upper * size + right, right * size + upper
 
 
 def _read_only(p: Matrix) -> Matrix:

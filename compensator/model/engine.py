@@ -13,6 +13,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -168,8 +169,7 @@ class _Part:
     uncertain: list[EffectStream]
 
 
-@dataclass(frozen=True, slots=True)
-class _PartEstimate:
+class _PartEstimate(NamedTuple):
     """What a part of the model gives after a sample; its variance is without that of sensor noise."""
 
     dtf_um: float

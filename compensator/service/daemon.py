@@ -9,7 +9,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -353,7 +353,7 @@ class Daemon:
         assert offset is not None
         published = entry.offsets()
         further = tuple(one for one in published.values() if isinstance(one, AxisOffset) and one.axis != FIRST)
-        outcome = replace(decided.outcome, offset=offset, further=further)
+        outcome = replace_fields(decided.outcome, offset=offset, further=further)
         self._note_state(offset, further)
         for topic, message in published.items():
             self._publish(topic, encode(message))

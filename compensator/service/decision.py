@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
+
+import msgspec
 
 from compensator.arrays import NAN
 from compensator.codes import Reason, State
@@ -20,8 +21,7 @@ from compensator.service.state import Memory
 VALID_SAMPLES = 2.5
 
 
-@dataclass(frozen=True, slots=True)
-class Limited:
+class Limited(msgspec.Struct, frozen=True):
     """An offset within its limits, its rate, and the limits that were reached."""
 
     offset_um: float
@@ -29,8 +29,7 @@ class Limited:
     reasons: tuple[Reason, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(msgspec.Struct, frozen=True):
     """State, reasons and offset of one sample; there is no offset before the first zero."""
 
     state: State
@@ -73,8 +72,7 @@ class Following(Protocol):
     model_changed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Condition:
+class Condition(msgspec.Struct, frozen=True):
     """What a sample means for every axis: reasons that are the machine's, and whether the offsets are held.
 
     Parameters

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import msgspec
 
 from compensator.arrays import NAN
@@ -15,8 +13,7 @@ from compensator.model.engine import Estimate, Reference
 from compensator.service.state import ZeroState
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(msgspec.Struct, frozen=True):
     """Outcome of one sample: the sample with final qualities, estimate, offset, events, and the decided probes.
 
     On a machine of several axes `offset` is that of Y, and `further` are those of the other axes.
@@ -30,8 +27,7 @@ class Outcome:
     further: tuple[AxisOffset, ...] = ()
 
 
-@dataclass(slots=True)
-class Values:
+class Values(msgspec.Struct):
     """Usable values of one sample; NaN where a channel is not usable.
 
     Parameters
@@ -62,8 +58,7 @@ class Values:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(msgspec.Struct, frozen=True):
     """Deformation since the zero, its standard deviation, µm, and its growth over the next sample, µm/min.
 
     All are NaN before the first zero. A correction by probes is included; `is_limited` if it has reached its limit.

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -312,9 +312,9 @@ class FreeRun:
                 )
             if self._before_torn_um is not None:
                 own = compensation.status.handover
-                compensation.continue_from(
-                    replace(own, offset_um=self._before_torn_um, further=self._further_before_torn, probing=None)
-                )
+                offset_um, further = self._before_torn_um, self._further_before_torn
+                other = msgspec.structs.replace(own, offset_um=offset_um, further=further, probing=None)
+                compensation.continue_from(other)
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             before = compensation.status.handover

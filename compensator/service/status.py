@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+
+import msgspec
 
 from compensator.messages import EstimateMessage, number
 from compensator.messages_axes import AxesEstimate, further_bases
@@ -14,8 +15,7 @@ from compensator.service.probing import ProbingHandover
 from compensator.service.state import ZeroMode, ZeroState
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Zero:
+class Zero(msgspec.Struct, frozen=True, kw_only=True):
     """Reference values of temperatures and deformation; NaN if unknown.
 
     Parameters
@@ -34,7 +34,7 @@ class Zero:
     at_ref_degc: float
     y_ref_um: float
     y_base_um: float
-    further: Mapping[str, float] = field(default_factory=dict)
+    further: Mapping[str, float] = {}
 
     @classmethod
     def of_estimate(cls, estimate: EstimateMessage) -> Zero:
@@ -71,14 +71,13 @@ class Zero:
 
     def equals(self, other: Zero) -> bool:
         """Return whether all values are equal; two unknown values count as equal."""
-        *own, further = astuple(self)
-        *others, other_further = astuple(other)
+        *own, further = msgspec.structs.astuple(self)
+        *others, other_further = msgspec.structs.astuple(other)
         pairs = zip(own, others, strict=True)
         return further == other_further and all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Handover:
+class Handover(msgspec.Struct, frozen=True, kw_only=True):
     """State that a compensation passes on to its successor, so that the published offset does not jump.
 
     Parameters
@@ -103,11 +102,10 @@ class Handover:
     waiting_zero: ZeroMode | None = None
     model_changed: bool = False
     probing: ProbingHandover | None = None
-    further: Mapping[str, float] = field(default_factory=dict)
+    further: Mapping[str, float] = {}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CompensationStatus:
+class CompensationStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A compensation after its last sample.
 
     Parameters

@@ -20,6 +20,7 @@ from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
 matplotlib.use("Agg")
+pytestmark = pytest.mark.usefixtures("equal_pictures_once")
 
 
 @pytest.fixture(scope="module")

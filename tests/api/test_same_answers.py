@@ -6,6 +6,7 @@ import contextlib
 import csv
 import io
 import json
+import pickle
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -37,6 +38,24 @@ ORDER = ("--order", 1, 1, 1)
 forms = pytest.mark.parametrize("form", FORMS)
 #: A text is taken for a path in one place.
 long_forms = pytest.mark.parametrize("form", [form for form in FORMS if form != "text"])
+
+
+pytestmark = pytest.mark.usefixtures("equal_pictures_once")
+_found: dict[bytes, Any] = {}
+
+
+@pytest.fixture
+def equal_questions_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search once for what the same model lacks in data that are equal to the bit; the command has searched itself."""
+    find = diagnosis.find_effects
+
+    def once(model: Any, runs: Any, **settings: Any) -> Any:
+        key = pickle.dumps((model, runs, settings["expected"]))
+        if key not in _found:
+            _found[key] = find(model, runs, **settings)
+        return _found[key]
+
+    monkeypatch.setattr(diagnosis, "find_effects", once)
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +162,7 @@ def test_identify(tmp_path: Path, folder: Path, form: str, identified: tuple[dic
     assert found.std_errors["tdtf_gain_um_per_k"] == printed["paths"]["TDTF"]["gain"]["std"]
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(
     ("words", "options"),
     [
@@ -187,6 +207,7 @@ def test_simulate(tmp_path: Path, folder: Path, form: str) -> None:
     assert found.scores.rms_um == printed["rms_um"]
 
 
+@pytest.mark.usefixtures("equal_questions_once")
 @long_forms
 def test_diagnose(tmp_path: Path, folder: Path, form: str, diagnosed: tuple[dict[str, Any], str]) -> None:
     (printed, text), out = diagnosed, folder / "diagnosis"
@@ -213,6 +234,7 @@ def test_diagnose(tmp_path: Path, folder: Path, form: str, diagnosed: tuple[dict
         assert (tmp_path / "saved" / name).read_bytes() == (out / name).read_bytes()
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_model_handed_over_in_python_is_diagnosed_as_its_file_is(tmp_path: Path, folder: Path) -> None:
     # The calibration's own error decides what a diagnosis looks for: it comes along without a file.
     found = tc.identify(folder / "run.csv", order=(2, 2, 2))

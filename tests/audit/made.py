@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +138,7 @@ class Service:
         status = self.compensation.status
         new.begin(status.zero)
         changed = not math.isnan(status.target_um)
-        new.continue_from(replace(status.handover, model_changed=changed))
+        new.continue_from(msgspec.structs.replace(status.handover, model_changed=changed))
         self.compensation = new
         self.recorder.attachments = {**self.recorder.attachments, "model.toml": model}
         self.recorder.start_new()

@@ -12,6 +12,8 @@ from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from tests.diagnose.scenarios import draw, record
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):

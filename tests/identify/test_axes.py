@@ -114,6 +114,7 @@ def test_what_is_said_names_the_axis(found, tmp_path):
         tc.identify(whole | {"z_um": np.zeros(whole["t_s"].size)}, axis="z")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_summary_has_a_column_for_each_axis(found, tmp_path):
     text = found.summary()
     assert "Y and Z have common time constants" in text and "X has its own" in text

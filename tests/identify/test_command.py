@@ -14,6 +14,8 @@ from compensator.model.model_file import load_model
 from tests.api.tables import write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W, published
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
 SPINDLE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 
 

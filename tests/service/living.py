@@ -30,9 +30,9 @@ from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
 from compensator.service.transfer.model_store import ModelStore, check_model
 from compensator.service.transfer.restart import resume
-from sim_hardware.physics import Duty, PublishedQuill, World
+from sim_hardware.physics import PublishedQuill, World
 from tests.service.promises import Promises
-from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
+from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config, working_day
 
 MACHINE = "vmc-07"
 
@@ -52,7 +52,7 @@ class Machine:
         self.config = conf or settings()
         self.config_bytes = b"the configuration"
         self.configured = model or read_model_bytes("quill")
-        self.world = World(PublishedQuill(), Duty.working_day(1, hours=72), seed=1)
+        self.world = World(PublishedQuill(), working_day(1, 72.0), seed=1)
         self.device = FakeDevice([functools.partial(self.world.truth, name) for name in CHANNELS])
         self.outcomes: list[Outcome] = []
         self.published: list[tuple[str, bytes]] = []

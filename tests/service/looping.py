@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -37,6 +38,7 @@ def settings(**changes: Any) -> Config:
     return config(**{"loop": loop, "limits": LIMITS, **changes})
 
 
+@functools.cache
 def extended(gain: float = 3.0, std: float = 0.05, *, tau_min: float = 60.0) -> bytes:
     """The published model with the effect of the coolant."""
     table = {"channel": "coolant_degc", "curve": "linear", "tau_min": [tau_min], "gain": [gain], "delay_min": 5.0}
@@ -44,11 +46,13 @@ def extended(gain: float = 3.0, std: float = 0.05, *, tau_min: float = 60.0) -> 
     return _with(effect)
 
 
+@functools.cache
 def stronger(change: float) -> bytes:
     """The published model with another gain, which the machine does not have."""
     return _with(effect_from("gain", {"path": "DTF", "change": change}))
 
 
+@functools.cache
 def together(*models: bytes) -> bytes:
     """The published model with the effects of several others."""
     return _with(*(effect for model in models for effect in parse_model(model, source="test").effects))

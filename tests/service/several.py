@@ -29,11 +29,11 @@ from compensator.service.daemon import Daemon
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.restart import resume
-from sim_hardware.physics import Duty, MachineOfAxes, PublishedQuill, World, usual_sensors
+from sim_hardware.physics import MachineOfAxes, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.axes import USUAL
 from tests.audit.made import CONFIG as ONE_AXIS
 from tests.service.promises import Promises
-from tests.service.simulated import START_NS, FakeDevice
+from tests.service.simulated import START_NS, FakeDevice, working_day
 
 MACHINE = "vmc-07"
 CHANNELS = ("t_q_degc", "at_degc", "y_um", "coolant_degc", "x_um", "z_um")
@@ -118,7 +118,7 @@ class SeveralAxes:
 
     def __init__(self, folder: Path, config: bytes, model: bytes, *, noise: bool = False) -> None:
         self.folder, self.text, self.configured = folder, config, model
-        duty = Duty.working_day(1, hours=72)
+        duty = working_day(1, 72.0)
         usual = usual_sensors(duty.extra_names)
         sensors = usual | {"x_um": usual["y_um"], "z_um": usual["y_um"]} if noise else {}
         self.world = World(MachineOfAxes(PublishedQuill()), duty, sensors, seed=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -66,6 +67,15 @@ TABLE: dict[str, Any] = {
 }
 
 
+@functools.cache
+def working_day(seed: int, hours: float) -> Duty:
+    """A day's work, which is the same for every machine of a test run; its columns are read only."""
+    duty = Duty.working_day(seed, hours=hours)
+    for column in duty.columns.values():
+        column.flags.writeable = False
+    return duty
+
+
 def config(**changes: Any) -> Config:
     """The usual configuration with some tables replaced."""
     return msgspec.convert({**TABLE, **changes}, Config)
@@ -97,7 +107,7 @@ class Bench:
 
     def __init__(self, tmp_path: Any, conf: Config | None = None, *, seed: int = 1, noise: bool = True) -> None:
         self.config = conf or config()
-        duty = Duty.working_day(seed, hours=48)
+        duty = working_day(seed, 48.0)
         sensors = usual_sensors(duty.extra_names) if noise else None
         self.world = World(PublishedQuill(), duty, sensors, seed)
         self.device = FakeDevice([self.world.source(name) for name in CHANNELS])

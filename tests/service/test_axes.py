@@ -340,7 +340,7 @@ def test_a_zero_before_the_record_is_that_of_every_axis() -> None:
     zero = running.status.zero
     assert zero is not None and abs(zero.further["z"]) > 3.0 and zero.further.keys() == running.outputs.states.keys()
     recorded = msgspec.json.decode(encode(outcome.estimate), type=AxesEstimate)
-    assert Zero.of_estimate(recorded).equals(zero) and not dataclasses.replace(zero, further={}).equals(zero)
+    assert Zero.of_estimate(recorded).equals(zero) and not msgspec.structs.replace(zero, further={}).equals(zero)
     other = compensation()
     other.begin(zero)
     again = processed(other, 1, 122)[-1].estimate.axes  # type: ignore[attr-defined]

@@ -412,6 +412,51 @@ def test_a_loose_contact_that_comes_to_rest_is_used_again_and_unconfirmed(
     assert resumed[-1].offset.state == "ok"
 
 
+@pytest.mark.parametrize("size", [9.0, -9.0])
+@pytest.mark.parametrize("again", [1, 6])
+def test_a_loose_contact_that_was_used_for_hours_and_jumps_again_keeps_what_it_showed(
+    day: dict[str, np.ndarray], size: float, again: int
+) -> None:
+    """One bad sample, or a few: that says nothing about the hours before it."""
+    at_first, later = loose("t_q_degc", size, 100, 200), 600
+
+    def change(i: int, values: dict[str, float]) -> None:
+        at_first(i, values)
+        values["t_q_degc"] += size if later <= i < later + again else 0.0
+
+    def missing(i: int, values: dict[str, float]) -> None:
+        values["t_q_degc"] = math.nan if later <= i < later + again + 30 else values["t_q_degc"]
+
+    outcomes = run(day, change)
+    states = np.array([str(o.offset.state) for o in outcomes])
+    assert set(states[240:later]) == {"degraded"}
+    assert "suspect_channel:t_q_degc" in outcomes[later + 1].offset.reasons and "ok" not in states[later:]
+    # As without it for the time in which it is suspect.
+    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, missing)))[300:]) < 3.0
+    assert "unconfirmed_channel:t_q_degc" in outcomes[later + again + 31].offset.reasons
+
+
+@pytest.mark.parametrize("size", [5.0, -5.0])
+def test_a_deviation_contains_what_a_wrong_rest_did_after_a_further_jump_too(
+    day: dict[str, np.ndarray], size: float
+) -> None:
+    """Until something decides: the rest may have been at a wrong level."""
+    at_first, mend = loose("t_q_degc", size, 200, 300), 420
+
+    def change(i: int, values: dict[str, float]) -> None:
+        at_first(i, values)
+        values["t_q_degc"] += size if 300 <= i < mend else 0.0
+
+    outcomes = run(day, change)
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    used = [i for i in events(outcomes, "unconfirmed") if 230 <= i < mend]
+    assert used and apart[mend - 1] > 10.0
+    assert "ok" not in {o.offset.state for o in outcomes[used[0] :]}
+    stds = [number(o.offset.y_offset_std_um) for o in outcomes[mend - 1 : mend + 10]]
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[mend : mend + 10])
+    assert min(stds) > 0.7 * stds[0]
+
+
 @pytest.mark.parametrize("size", [8.0, -8.0])
 def test_a_loose_contact_of_the_air_that_rests_where_no_air_can_be_is_not_used(
     day: dict[str, np.ndarray], size: float

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -273,7 +272,7 @@ def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
     outcomes = [step.outcome for step in [*steps, *run(loop, source)]]
     assert any(is_alarmed(outcome.offset.reasons) for outcome in outcomes)
     apart = msgspec.structs.replace(outcomes[700].offset, reasons=["t_q_at_apart"])
-    outcomes[700] = dataclasses.replace(outcomes[700], offset=apart)
+    outcomes[700] = msgspec.structs.replace(outcomes[700], offset=apart)
     y = usable_table(outcomes).columns["y_um"]
     left_out = {*range(300, 360), *range(641, 701)}
     assert {int(i) for i in np.flatnonzero(np.isnan(y))} == left_out

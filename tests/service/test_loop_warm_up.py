@@ -1,6 +1,5 @@
 """A candidate is at the level that it would have if it had run since the zero, however short the record is."""
 
-import dataclasses
 from typing import Any
 
 import msgspec
@@ -59,7 +58,7 @@ def test_a_pause_in_the_record_counts(record: list[Outcome]) -> None:
         by_hand.process(outcome.sample)
     assert predicted(paused) == pytest.approx(predicted(by_hand), abs=1e-9)
     squeezed = [
-        dataclasses.replace(outcome, sample=_moved(outcome.sample, i), estimate=outcome.estimate)
+        msgspec.structs.replace(outcome, sample=_moved(outcome.sample, i), estimate=outcome.estimate)
         for i, outcome in enumerate(gap)
     ]
     assert not np.isclose(predicted(warmed_on(settings(), model, squeezed)), predicted(paused), atol=1e-6)

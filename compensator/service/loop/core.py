@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import msgspec
 from msgspec.structs import replace as replace_fields
@@ -32,8 +32,7 @@ SHADOW_FILES: Mapping[PlaceName, tuple[str, str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Followed:
+class Followed(msgspec.Struct, frozen=True):
     """What the loop made of a sample: the records of the models in shadow, and events."""
 
     candidates: tuple[Candidate, ...]
@@ -144,7 +143,7 @@ class ModelLoop:
         if running is None:
             return weighed
         data = replace_fields(weighed.data, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns)
-        return replace(weighed, data=data)
+        return dataclasses.replace(weighed, data=data)
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis."""
@@ -210,7 +209,7 @@ class ModelLoop:
         outgoing = self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
         # What holds the published offset concerns the new one only.
-        present.continue_from(replace(handover, operator_hold=False, internal_error=False, probing=None))
+        present.continue_from(replace_fields(handover, operator_hold=False, internal_error=False, probing=None))
         if outgoing is not None:
             self.shadows[outgoing] = Shadow(present, data)
         self.drop_ended()
@@ -227,7 +226,7 @@ class ModelLoop:
 
 def _handed_over(present: Compensation) -> Handover:
     """Return what another model continues from."""
-    return replace(present.status.handover, model_changed=present.status.zero is not None)
+    return replace_fields(present.status.handover, model_changed=present.status.zero is not None)
 
 
 def _exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData, level_um: float) -> Note:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import msgspec
 
@@ -28,8 +27,7 @@ from compensator.service.transfer.candidate import WARM_UP
 __all__ = ["Diagnosed", "LoopRun", "LoopStep"]
 
 
-@dataclass(frozen=True, slots=True)
-class LoopStep:
+class LoopStep(msgspec.Struct, frozen=True):
     """What a sample gave.
 
     Parameters

@@ -5,8 +5,10 @@ It passes the same pauses, zeros and probes as the present compensation. Its own
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 from compensator.codes import ProbeCode, Reason
 from compensator.config import Config
@@ -63,7 +65,7 @@ class Shadow:
         probes = tuple(probe for probe in outcome.probes if _is_compared(probe))
         received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
         self.compensation.receive_probes([probe for probe in received if probe is not None])
-        return replace(outcome, probes=probes), self.compensation.process(outcome.sample)
+        return msgspec.structs.replace(outcome, probes=probes), self.compensation.process(outcome.sample)
 
 
 def _is_compared(probe: Probe) -> bool:

@@ -95,9 +95,30 @@ class JumpEngines:
         for run in (self.believing, self.shifted):
             run.estimate = run.engine.skip(samples, held=held)
 
-    def believe_as_shifted(self) -> None:
-        """Give the believing engine the state of the shifted one: the channel has jumped again."""
-        self.believing.engine.restore(self.shifted.engine.snapshot())
+    def believe_from(self, engine: Engine) -> None:
+        """Give the believing engine the state of another one: the channel has jumped again."""
+        self.believing.engine.restore(engine.snapshot())
+
+    def go_without(
+        self, engine: Engine, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
+    ) -> Estimate:
+        """Step the compensation's engine without the channels that have jumped, and let it bridge as long as these do.
+
+        Parameters
+        ----------
+        engine : Engine
+            Engine of the compensation.
+        state : JumpState
+            State of the watch.
+        offered, others : mapping of str to float
+            Measured temperatures, °C, and usable values of the auxiliary channels.
+        """
+        without = Engine(engine.model, bridge_samples=BRIDGED_SAMPLES)
+        without.restore(engine.snapshot())
+        values = {name: NAN if name in state.shifts_k else value for name, value in offered.items()}
+        estimate = without.step(values["t_q_degc"], values["at_degc"], others)
+        engine.restore(without.snapshot())
+        return estimate
 
     def step(self, offered: Mapping[str, float], fed: Fed, others: Mapping[str, float]) -> None:
         """Step both by a sample."""
@@ -180,6 +201,16 @@ class JumpEngines:
                 return False
         return True
 
+    def fits(self, engine: Engine, state: JumpState, offered: Mapping[str, float]) -> bool:
+        """Return whether an engine expects the channels that have jumped rather than the shifted one does."""
+        ratio = 0.0
+        for name in state.shifts_k:
+            if not math.isnan(offered[name]):
+                for one, sign in ((engine, 1.0), (self.shifted.engine, -1.0)):
+                    expected, std = expected_value(one, name, offered["at_degc"])
+                    ratio -= sign * (0.5 * ((offered[name] - expected) / std) ** 2 + math.log(std))
+        return ratio >= 0.0
+
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
         if is_unsteady(state):
@@ -218,21 +249,6 @@ class JumpEngines:
         if believing < _FITS and shifted > believing + _CONTRADICTS:
             return 1
         return -1 if shifted < max(_FITS, _FITS_PART * believing) and believing > shifted + _CONTRADICTS else 0
-
-    @property
-    def apart_um(self) -> float:
-        """Difference of their predictions, µm; 0 before the first sample."""
-        believing, shifted = self.believing.estimate, self.shifted.estimate
-        return abs(believing.y_um - shifted.y_um) if believing is not None and shifted is not None else 0.0
-
-    @property
-    def outputs_apart(self) -> tuple[float, ...]:
-        """Difference of their predictions of each further output, in its unit; empty before the first sample."""
-        believing, shifted = self.believing.estimate, self.shifted.estimate
-        if believing is None or shifted is None:
-            return ()
-        pairs = zip(believing.outputs, shifted.outputs, strict=True)
-        return tuple(abs(one.value - other.value) for one, other in pairs)
 
 
 def is_unsteady(state: JumpState) -> bool:
@@ -275,6 +291,12 @@ def expected_value(engine: Engine, name: str, at_degc: float) -> tuple[float, fl
     """Return the expected value of a channel and its standard deviation, °C and K."""
     found = engine.forecast(at_degc)
     return (found.at_k, found.at_std_k) if name == "at_degc" else (found.t_q_k, found.t_q_std_k)
+
+
+def shifts_against(engine: Engine, state: JumpState) -> dict[str, float]:
+    """Return by how much the last values of the channels that have jumped differ from what an engine expects, K."""
+    at_degc = NAN if "at_degc" in state.shifts_k else state.last.get("at_degc", NAN)
+    return {name: state.last[name] - expected_value(engine, name, at_degc)[0] for name in state.shifts_k}
 
 
 def _has_returned(difference: float, std: float, shift: float, first: float) -> bool:

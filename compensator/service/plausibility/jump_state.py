@@ -51,6 +51,10 @@ class JumpState(msgspec.Struct, kw_only=True):
         By channel: samples since its last value.
     is_unconfirmed : bool
         Whether these channels read otherwise than expected after samples without them; they are used meanwhile.
+    was_used : bool
+        Whether they were used like that until they jumped again: the compensation's engine knows what they showed.
+    age, loose : int
+        Samples since the first jump, or since what they showed was kept; how many of them had passed at the last jump.
     y_for, y_against : int
         Consecutive samples for which measured Y has spoken for the believing engine, and for the shifted one.
     probes_for, probes_against : int
@@ -67,6 +71,9 @@ class JumpState(msgspec.Struct, kw_only=True):
     quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
     is_unconfirmed: bool = False
+    was_used: bool = False
+    age: int = 0
+    loose: int = 0
     last: dict[str, float] = {}
     unseen: dict[str, int] = {}
     samples: int = 0

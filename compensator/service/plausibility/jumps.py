@@ -30,6 +30,12 @@ T_Q its expectation is soon too wide for a return to show. Once the channel has 
 have to be back, and where the shifted engine thinks possible, it is like a couple that was open: used again, and
 unconfirmed. The believing engine starts with its last jump.
 
+An unconfirmed channel that jumps again says that it is wrong now, not that it was wrong before. Unless something has
+contradicted it, or it was at rest for a shorter time than it was loose before, the compensation's engine keeps what it
+has shown and goes on without it. The shifted engine still believes none of it; their difference stays part of the
+standard deviation. The channel is believed anew from the one of both that expects its new level rather: where it comes
+to rest elsewhere, one of both levels was wrong.
+
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
 
@@ -37,7 +43,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import msgspec
 
@@ -58,26 +63,27 @@ from compensator.service.plausibility.jump_engines import (
     is_unsteady,
     moves,
     needed_samples,
+    shifts_against,
+)
+from compensator.service.plausibility.jump_evidence import (
+    confirmed_by,
+    is_contradicted,
+    is_unlikely,
+    weigh_probe,
+    weigh_y,
 )
 from compensator.service.plausibility.jump_signs import NAMES, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
-#: Log likelihood ratio, and least number of samples, for the model to agree with a channel.
-_AGREES, _AGREES_SAMPLES = 12.0, 10
-#: A jump within the permitted rate is watched for this number of samples, and refuted at this log likelihood ratio.
-WATCHED_SAMPLES, _REFUTED = 15, 12.0
-#: Consecutive samples for which Y must speak for a channel.
-Y_SAMPLES = 10
-#: Probes that must speak for a channel: one may have met a chip.
-_PROBES = 2
+#: A jump within the permitted rate is watched for this number of samples.
+WATCHED_SAMPLES = 15
 #: Weight of a new residual in the level before a jump.
 _LEVEL = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(msgspec.Struct, frozen=True):
     """What a sample has shown.
 
     Parameters
@@ -91,8 +97,8 @@ class Judgement:
     """
 
     estimate: Estimate | None = None
-    notes: list[Note] = field(default_factory=list)
-    accepted: dict[str, float] = field(default_factory=dict)
+    notes: list[Note] = []
+    accepted: dict[str, float] = {}
 
 
 class JumpWatch:
@@ -113,6 +119,7 @@ class JumpWatch:
         self._y_std_um = stated or model.y_std_um
         self._state = JumpState()
         self._engines: JumpEngines | None = None
+        self._estimate: Estimate | None = None
 
     def describe(self) -> str:
         """Describe whether jumps are watched for."""
@@ -126,11 +133,12 @@ class JumpWatch:
 
     @property
     def doubts(self) -> tuple[float, ...]:
-        """As `doubt_um`, of each further output in its unit; empty where no channel is unconfirmed."""
-        engines = self._engines
-        if engines is None or not self._state.is_unconfirmed:
+        """As `doubt_um`, of each further output in its unit; empty where no channel is, or was, unconfirmed."""
+        answers = self._answers()
+        if answers is None:
             return ()
-        return tuple(apart / math.sqrt(2.0) for apart in engines.outputs_apart)
+        pairs = zip(*(answer.outputs for answer in answers), strict=True)
+        return tuple(abs(one.value - other.value) / math.sqrt(2.0) for one, other in pairs)
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -144,9 +152,9 @@ class JumpWatch:
 
     @property
     def doubt_um(self) -> float:
-        """Standard deviation by unconfirmed channels, µm: either engine may be right."""
-        engines = self._engines
-        return engines.apart_um / math.sqrt(2.0) if engines is not None and self._state.is_unconfirmed else 0.0
+        """Standard deviation by channels that are, or were, used unconfirmed, µm: either engine may be right."""
+        answers = self._answers()
+        return abs(answers[0].y_um - answers[1].y_um) / math.sqrt(2.0) if answers is not None else 0.0
 
     @property
     def state(self) -> JumpState:
@@ -213,11 +221,15 @@ class JumpWatch:
             return [], None
         new_zero = new_zero and self._model.inputs == "changes"
         run = engines.shifted if new_zero else engines.believing
-        engine.restore(run.engine.snapshot())
-        if new_zero:
+        estimate: Estimate | None = run.estimate
+        if new_zero and self._state.was_used:
+            # What the engine has gone on from stays; its estimate does, too.
+            shifts, estimate = shifts_against(engine, self._state), None
+        else:
             shifts = self._state.shifts_k
+            engine.restore(run.engine.snapshot())
+        if new_zero:
             engine.shift_reference(shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0))
-        estimate = run.estimate
         self._end()
         return names, estimate
 
@@ -246,12 +258,13 @@ class JumpWatch:
         offered = {name: _offered(channels.get(name)) for name in TEMPERATURES}
         jumped = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         notes: list[Note] = []
+        was_unconfirmed = self._state.is_unconfirmed
         seen_again = self._seen_again(offered)
         if self._engines is not None and is_unsteady(self._state) and set(jumped) <= set(self._state.shifts_k):
             if jumped or moves(self._state, offered, self._change_k):
                 notes += self._unsettle(engine, self._engines, offered)
-        elif jumped and self._state.is_unconfirmed:
-            self._suspect()
+        elif self._engines is not None and jumped and self._state.is_unconfirmed:
+            self._use_no_longer(engine, self._engines, offered)
         elif jumped and not self._state.is_suspect:
             self._begin(engine, self._state.begun(is_suspect=True))
         elif not self._state.shifts_k and self._signs is not None:
@@ -268,7 +281,7 @@ class JumpWatch:
         fed = engines.feed(self._state, offered, jumped, self._change_k)
         count_held(self._state, engine, offered["at_degc"])
         if fed.jumped and self._state.is_suspect:
-            engines.believe_as_shifted()
+            self._believe_anew(engine, engines, offered)
             self._state.start_evidence()
             notes += [jump_note(name, self._state.shifts_k[name]) for name in jumped if name in fed.jumped]
         elif fed.jumped and self._state.is_unconfirmed:
@@ -276,10 +289,12 @@ class JumpWatch:
         engines.weigh(self._state, offered, fed)
         engines.step(offered, fed, others)
         self._state.samples += 1
-        self._weigh_y(engines, y_um)
+        self._state.age += 1
+        weigh_y(self._state, engines, y_um, self._y_std_um)
         is_suspect = self._state.is_suspect
+        estimate = engines.go_without(engine, self._state, offered, others) if was_unconfirmed and is_suspect else None
         verdict = (self._suspected if is_suspect else self._watched)(engine, engines, offered)
-        return Judgement(verdict.estimate, [*notes, *verdict.notes], verdict.accepted)
+        return Judgement(verdict.estimate or estimate, [*notes, *verdict.notes], verdict.accepted)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
         """Compare both engines with a probe.
@@ -293,16 +308,13 @@ class JumpWatch:
         predicted_um : float
             Prediction of the compensation after the last sample, µm, without a correction.
         """
-        state = self._state
-        if not (state.is_suspect or state.is_unconfirmed) or self._engines is None or math.isnan(innovation_um):
-            return
-        speaks = self._engines.speaks(innovation_um + predicted_um, math.hypot(std_um, self._y_std_um))
-        state.probes_for += speaks > 0
-        state.probes_against += speaks < 0
+        if self._engines is not None:
+            std_um = math.hypot(std_um, self._y_std_um)
+            weigh_probe(self._state, self._engines, innovation_um + predicted_um, std_um)
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
-        state = self._state
+        state, self._estimate = self._state, estimate
         if not self.is_on or state.shifts_k:
             return
         state.quiet = min(state.quiet + 1, FORGOTTEN_SAMPLES)
@@ -319,10 +331,35 @@ class JumpWatch:
         self._engines = JumpEngines.begin(self._model, engine.snapshot())
         self._state = state
 
-    def _suspect(self) -> None:
+    def _answers(self) -> tuple[Estimate, Estimate] | None:
+        """Return both answers as long as a channel is, or was, used that nothing confirms."""
+        state, engines = self._state, self._engines
+        if engines is None or not (state.is_unconfirmed or (state.is_suspect and state.was_used)):
+            return None
+        used, other = engines.believing.estimate if state.is_unconfirmed else self._estimate, engines.shifted.estimate
+        return (used, other) if used is not None and other is not None else None
+
+    def _suspect(self, *, was_used: bool = False) -> None:
         """Use the channels no longer that were watched or unconfirmed."""
-        self._state.is_suspect, self._state.is_unconfirmed = True, False
+        self._state.is_suspect, self._state.is_unconfirmed, self._state.was_used = True, False, was_used
         self._state.start_evidence()
+
+    def _use_no_longer(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
+        """Suspect unconfirmed channels that jump again: what they have shown is kept if nothing contradicts it."""
+        state = self._state
+        was_used = state.age - state.loose > state.loose and not is_contradicted(state)
+        if was_used:
+            state.age = 0
+        else:
+            engine.restore(engines.shifted.engine.snapshot())
+        self._suspect(was_used=was_used)
+        self._believe_anew(engine, engines, offered)
+
+    def _believe_anew(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
+        """Let the believing engine begin with this jump: what was wrong before it is undone."""
+        self._state.loose = self._state.age
+        is_kept = self._state.was_used and engines.fits(engine, self._state, offered)
+        engines.believe_from(engine if is_kept else engines.shifted.engine)
 
     def _unsettle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> list[Note]:
         """Account for a further jump of a loose contact."""
@@ -332,13 +369,12 @@ class JumpWatch:
             state.samples = 0
             return []
         state.at_held = 0
-        engines.believe_as_shifted()
         state.again += 1
         if state.is_suspect:
+            self._believe_anew(engine, engines, offered)
             state.start_evidence()
             return []
-        engine.restore(engines.shifted.engine.snapshot())
-        self._suspect()
+        self._use_no_longer(engine, engines, offered)
         return [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
 
     def _going_on(self, signs: JumpSigns, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
@@ -355,23 +391,14 @@ class JumpWatch:
             name for name, samples in unseen.items() if samples >= UNSEEN_SAMPLES and name not in self._state.unseen
         ]
 
-    def _weigh_y(self, engines: JumpEngines, y_um: float) -> None:
-        """Count the samples for which measured Y has spoken for one engine."""
-        state = self._state
-        if math.isnan(y_um) or math.isnan(state.level_um) or not self._y_std_um > 0.0:
-            return
-        speaks = engines.speaks(y_um - state.level_um, self._y_std_um)
-        state.y_for = state.y_for + 1 if speaks > 0 else 0
-        state.y_against = state.y_against + 1 if speaks < 0 else 0
-
     def _suspected(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
         state = self._state
         needed = needed_samples(state)
         if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
             return self._accept(engine, offered, engines.shifted, "has returned to what was expected before")
-        if state.at_held >= needed:
+        if state.at_held >= needed and not state.was_used:
             return self._accept(engine, offered, None, "has returned to where it was before")
-        by = self._confirmed_by()
+        by = confirmed_by(state)
         if by:
             return self._accept(engine, offered, engines.believing, f"is used again: {by} with it")
         if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
@@ -390,17 +417,6 @@ class JumpWatch:
         state.is_suspect, state.is_unconfirmed = False, True
         state.samples, state.ratio = 0, 0.0
         return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
-
-    def _confirmed_by(self) -> str:
-        """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
-        state = self._state
-        if state.y_for >= Y_SAMPLES:
-            return "measured Y agrees"
-        if state.probes_for >= _PROBES:
-            return "probes agree"
-        if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
-            return "the model agrees"
-        return ""
 
     def _accept(self, engine: Engine, offered: Mapping[str, float], run: Run | None, how: str) -> Judgement:
         names = list(self._state.shifts_k)
@@ -422,14 +438,13 @@ class JumpWatch:
     def _watched(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
         """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor."""
         state, shifted = self._state, engines.shifted
-        is_refuted = state.ratio <= -_REFUTED
+        is_refuted = is_unlikely(state)
         if state.is_unconfirmed:
-            by = self._confirmed_by()
+            by = confirmed_by(state)
             if by:
                 return self._accept(engine, offered, None, f"is confirmed: {by} with it")
             # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
-            against = state.y_against >= Y_SAMPLES or state.probes_against >= _PROBES
-            is_refuted |= against and not is_unsteady(state)
+            is_refuted |= is_contradicted(state) and not is_unsteady(state)
         if is_refuted:
             engine.restore(shifted.engine.snapshot())
             estimate = shifted.estimate

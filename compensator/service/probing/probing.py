@@ -39,8 +39,7 @@ _KNOWN = 100
 _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Corrected:
+class Corrected(msgspec.Struct, frozen=True, kw_only=True):
     """What the probes add to the prediction of a sample; all zero before the first probe.
 
     Parameters

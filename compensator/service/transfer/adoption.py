@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -186,7 +186,7 @@ class Adoption:
         new = candidate.compensation
         before = old.status
         has_offset = not math.isnan(before.target_um)
-        new.continue_from(replace(before.handover, model_changed=has_offset))
+        new.continue_from(msgspec.structs.replace(before.handover, model_changed=has_offset))
         after = new.status
         difference = after.target_um - before.target_um
         self._journal.start_new_file(order.ready.data)

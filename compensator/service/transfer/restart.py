@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from compensator.codes import Reason
 from compensator.config import LoadedConfig, parse_config
@@ -43,7 +45,8 @@ class Resumed:
     def continue_from(self, offset_um: float, further: Mapping[str, float]) -> None:
         """Continue from other offsets than the compensation's own: that of Y, µm, and further outputs by name."""
         own = self.compensation.status.handover
-        self.compensation.continue_from(replace(own, offset_um=offset_um, further=further, probing=None))
+        other = msgspec.structs.replace(own, offset_um=offset_um, further=further, probing=None)
+        self.compensation.continue_from(other)
 
 
 @dataclass(slots=True)
@@ -247,7 +250,7 @@ def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: Therma
             std_um=candidate.compensation.status.std_um,
         )
     resumed.compensation.continue_from(
-        replace(
+        msgspec.structs.replace(
             last.handover,
             waiting_zero=resumed.compensation.status.handover.waiting_zero,
             model_changed=last.state is None or last.state.model_sha256 != model.sha256,

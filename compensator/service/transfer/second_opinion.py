@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
+
+import msgspec
 
 from compensator.axes import FIRST, AxisWords, label_of
 from compensator.clock import NS
@@ -171,7 +172,7 @@ def _run(
             _compare(found, step, outcomes[0], outcomes[1])
     present, candidate = (run.compensation for run in runs)
     # As at the exchange: with probes the corrected deformation stays as it is.
-    candidate.continue_from(replace(present.status.handover, model_changed=True))
+    candidate.continue_from(msgspec.structs.replace(present.status.handover, model_changed=True))
     before, after = ({FIRST: one.status.target_um, **one.further_targets} for one in (present, candidate))
     moves = {axis: after[axis] - before[axis] for axis in axes}
     return found, {axis: move for axis, move in moves.items() if not math.isnan(move)}

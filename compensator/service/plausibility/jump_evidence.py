@@ -1,0 +1,66 @@
+"""Evidence for and against a channel that has jumped: measured Y, probes and what the model thinks likely."""
+
+from __future__ import annotations
+
+import math
+
+from compensator.service.plausibility.jump_engines import JumpEngines
+from compensator.service.plausibility.jump_state import JumpState
+
+#: Log likelihood ratio, and least number of samples, for the model to agree with a channel.
+_AGREES, _AGREES_SAMPLES = 12.0, 10
+#: Log likelihood ratio at which a jump within the permitted rate is refuted.
+_REFUTED = 12.0
+#: Consecutive samples for which Y must speak for a channel.
+_Y_SAMPLES = 10
+#: Probes that must speak for a channel: one may have met a chip.
+_PROBES = 2
+
+
+def weigh_y(state: JumpState, engines: JumpEngines, y_um: float, std_um: float) -> None:
+    """Count the samples for which measured Y has spoken for one engine.
+
+    Parameters
+    ----------
+    state : JumpState
+        State of the watch, which keeps the counts and the level of Y before the jump.
+    engines : JumpEngines
+        The two engines.
+    y_um, std_um : float
+        Measured Y, NaN if it cannot be used, and its standard deviation, µm.
+    """
+    if math.isnan(y_um) or math.isnan(state.level_um) or not std_um > 0.0:
+        return
+    speaks = engines.speaks(y_um - state.level_um, std_um)
+    state.y_for = state.y_for + 1 if speaks > 0 else 0
+    state.y_against = state.y_against + 1 if speaks < 0 else 0
+
+
+def weigh_probe(state: JumpState, engines: JumpEngines, y_um: float, std_um: float) -> None:
+    """Count a probe if it speaks for one engine; its value is on the scale of the prediction, NaN without one, µm."""
+    if not (state.is_suspect or state.is_unconfirmed) or math.isnan(y_um):
+        return
+    speaks = engines.speaks(y_um, std_um)
+    state.probes_for += speaks > 0
+    state.probes_against += speaks < 0
+
+
+def confirmed_by(state: JumpState) -> str:
+    """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
+    if state.y_for >= _Y_SAMPLES:
+        return "measured Y agrees"
+    if state.probes_for >= _PROBES:
+        return "probes agree"
+    if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
+        return "the model agrees"
+    return ""
+
+
+def is_contradicted(state: JumpState) -> bool:
+    """Return whether measured Y or probes speak for the shifted engine."""
+    return state.y_against >= _Y_SAMPLES or state.probes_against >= _PROBES
+
+
+def is_unlikely(state: JumpState) -> bool:
+    """Return whether the shifted engine has expected the channels far better."""
+    return state.ratio <= -_REFUTED
