@@ -152,10 +152,13 @@ def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 
 
 
 def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
-    """Return what follows from a diagnosis that has found another effect, or the same with other parameters."""
+    """Return what follows from a diagnosis that has found another effect, or the same with other parameters.
+
+    Nothing of it can be compared on the record.
+    """
     found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
     found = replace(found, same_effects=same, change_deviations=9.0 if same else None)
-    (note,) = loop.receive(found, now_ns)
+    (note,) = loop.receive(found, now_ns) or loop.prefer(judged(NOT_JUDGED))
     return note.data["step"], note.data.get("why", "")
 
 
