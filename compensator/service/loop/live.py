@@ -18,8 +18,7 @@ from compensator.config import Config
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.messages import Candidate, LoopStatus
-from compensator.model.thermal_model import ThermalModel
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop
@@ -144,14 +143,8 @@ class LiveLoop:
             self._begin_shadow(core, warmed)
         if not (core.state.exchange and self._stored):
             return present
+        new, self._model, note = core.exchange(present, self._model, present.status.time_utc_ns)
         self._stored = False
-        try:
-            new, model, note = core.exchange(present, self._model, present.status.time_utc_ns)
-        except Exception:
-            # The next start must find the model that goes on.
-            self._storing = asyncio.create_task(self._store_present(present.model))
-            raise
-        self._model = model
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._events.note(*note)
@@ -242,13 +235,15 @@ class LiveLoop:
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""
-        core, self._model = self._core, model
-        if core is None:
-            return
-        self._cancel()
-        core.present = present.model
-        self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
-        core.drop_ended()
+        self._model = model
+
+        def begin_anew(core: ModelLoop) -> None:
+            self._cancel()
+            core.present = present.model
+            self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
+            core.drop_ended()
+
+        self._guarded(begin_anew, None)
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured."""
@@ -258,8 +253,11 @@ class LiveLoop:
 
     def process(self, outcome: Outcome) -> tuple[Candidate, ...]:
         """Process a sample after the present compensation; return the records of the models in shadow."""
+
+        def alone(core: ModelLoop) -> Followed:
+            return Followed((), tuple(core.loop.step(outcome, {})))
+
         # The shadow is no part of what is published: its defect must neither hold the offset nor stop the service.
-        alone: Callable[[ModelLoop], Followed] = lambda core: Followed((), tuple(core.loop.step(outcome, {})))  # noqa: E731
         followed = self._guarded(lambda core: core.process(outcome), Followed((), ()), again=alone)
         self._note(followed.notes)
         self._candidates = followed.candidates
@@ -299,8 +297,9 @@ class LiveLoop:
             return again(core) if again is not None else otherwise
         except Exception:
             log.exception("internal error of the loop; it is off until the next start")
+        stored = self._stored
         self._cancel()
-        self._core = None
+        self._core, self._stored = None, stored
         self._journal.start_new_file()
         self._events.note(*_failed(f"{why}; the loop is off until the next start"))
         return otherwise
@@ -310,6 +309,9 @@ class LiveLoop:
         core = self._core
         if self._warming is not None:
             self._warming.since.append(outcome)
+        if self._stored and self._storing is None and not self.is_exchanging:
+            # An exchange that a defect has ended: the next start must find the model that goes on.
+            self._storing = asyncio.create_task(self._store_present())
         if core is None:
             return
         wanted = core.loop.wanted
@@ -360,11 +362,12 @@ class LiveLoop:
             self._not_stored = str(error)
         self._storing = None
 
-    async def _store_present(self, model: ThermalModel) -> None:
-        """Store the present model again, after another one was stored that could not replace it."""
-        store, name, now_ns = self._store.adopt, model.name, self._clock.utc_ns()
+    async def _store_present(self) -> None:
+        """Store the present model again, after another one was stored that has not replaced it."""
+        name, now_ns = model_of(self._config, self._model, source="present model").name, self._clock.utc_ns()
+        self._stored = False
         try:
-            await asyncio.to_thread(store, self._model, name=name, time_utc_ns=now_ns, by_loop=True)
+            await asyncio.to_thread(self._store.adopt, self._model, name=name, time_utc_ns=now_ns, by_loop=True)
         except ServiceError as error:
             log.error("the next start uses another model: %s", error)
         self._storing = None
