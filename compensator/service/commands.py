@@ -127,12 +127,21 @@ class Commands:
             name, arguments, sender = self._waiting.get_nowait()
             self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
-            if self._models is not None and name == CommandName.DISMISS:
-                self._models.dismiss(compensation)
-            elif self._models is not None and name == CommandName.RESUME:
-                self._models.resume()
-            elif self._models is not None and name == CommandName.ADOPT:
-                self._models.accept()
+            try:
+                self._answer(compensation, name, arguments)
+            except ServiceError as error:
+                self._note_refusal(name, str(error), sender)
+
+    def _answer(self, compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
+        """Pass a command on to the loop; the candidate that was meant may have given its place since the answer."""
+        if self._models is None:
+            return
+        if name == CommandName.DISMISS:
+            self._models.dismiss(compensation, arguments["sha256"])
+        elif name == CommandName.RESUME:
+            self._models.resume()
+        elif name == CommandName.ADOPT:
+            self._models.accept(arguments["sha256"])
 
     def _decide_candidate(
         self, name: str, request: ModelRequest, sender: Sender, reply: Future[dict[str, Any]]
@@ -153,7 +162,7 @@ class Commands:
             reply.set_result(refusal(f"{name}: {error}"))
             return
         self._is_answered = True
-        self._enqueue(name, {"candidate": True, "force": request.force}, sender)
+        self._enqueue(name, {"candidate": True, "force": request.force, "sha256": offer.sha256}, sender)
         done = "is adopted" if name == CommandName.ADOPT else "is dismissed"
         text = f"candidate {offer.named} {done}; {described(offer.comparison)}; acts at the next sample"
         figures = {"model_sha256": offer.sha256, "comparison": offer.comparison.table()}

@@ -30,7 +30,7 @@ from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
-from compensator.service.transfer import model_store
+from compensator.service.transfer import candidate, model_store
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.service.living import MACHINE
@@ -152,10 +152,13 @@ def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 
 
 
 def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
-    """Return what follows from a diagnosis that has found another effect, or the same with other parameters."""
+    """Return what follows from a diagnosis that has found another effect, or the same with other parameters.
+
+    Nothing of it can be compared on the record.
+    """
     found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
     found = replace(found, same_effects=same, change_deviations=9.0 if same else None)
-    (note,) = loop.receive(found, now_ns)
+    (note,) = loop.receive(found, now_ns) or loop.prefer(judged(NOT_JUDGED))
     return note.data["step"], note.data.get("why", "")
 
 
@@ -257,7 +260,7 @@ async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_opera
     machine = Looping(tmp_path, shown(extended()), shown(stronger(0.1)), policy="propose")
     machine.use(machine.config_bytes.replace(b"shadow_h = 6.0", b"shadow_h = 48.0"))
     await machine.run(1800, until=in_phase(machine, "shadow"))
-    works, adopted, warmed = live.warm_up, threading.Event(), threading.Event()
+    works, adopted, warmed = candidate.warm_up, threading.Event(), threading.Event()
 
     def late(*arguments: Any, **settings: Any) -> Any:
         machine.at_sample[len(machine.outcomes) + 5] = Asked(machine, "adopt", candidate=True, force=True)
@@ -274,9 +277,9 @@ async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_opera
         machine.waits_for_diagnoses = True
         return [one.offset.model_sha256 for one in machine.outcomes[-30:]].count(sha256_of(extended())) == 30
 
-    monkeypatch.setattr(live, "warm_up", late)
+    monkeypatch.setattr("compensator.service.loop.found.warm_up", late)
     await machine.run(1800, until=at_adoption)
-    assert warmed.is_set() and machine.steps()[-2:] == [("shadow", ""), ("adopt", "by_hand")]
+    assert warmed.is_set() and machine.steps()[-2:] == [("diagnose", "planned"), ("adopt", "by_hand")]
     assert {one.role for one in machine.candidates()[-29:]} == {"before"}
     assert opening_of(recordings(machine.recordings, MACHINE)[-1])["before.toml"] == QUILL
     checked(machine)

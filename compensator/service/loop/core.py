@@ -18,6 +18,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.place import rival_of
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
 from compensator.service.loop.state import LoopState, PlaceName, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
@@ -150,17 +151,16 @@ class ModelLoop:
         return self.loop.receive(found, now_ns)
 
     def prefer(self, newcomer: Newcomer) -> list[Note]:
-        """Decide whether what a diagnosis has found takes the place of a proposed candidate, once it is warmed up."""
-        proposed, settings = self.state.proposed, self._config.loop
-        if proposed is None or settings is None or not self.loop.is_contested:
-            return []
-        return self.loop.prefer(newcomer.beside(proposed, settings))
+        """Decide whether what a diagnosis has found gets its place, once it is warmed up."""
+        settings = self._config.loop
+        assert settings is not None
+        rival = rival_of(self.state, settings)
+        return self.loop.prefer(newcomer.beside(rival, settings) if rival is not None else None)
 
     @property
     def is_free(self) -> bool:
-        """Whether a candidate that is warmed up gets its place."""
-        state = self.state
-        return state.diagnosis is not None and not state.exchange and not self.loop.is_contested
+        """Whether what is warmed up gets its place now."""
+        return self.state.has_next and not self.state.exchange
 
     def begin_shadow(
         self, compensation: Compensation, data: bytes, now_ns: int, role: Role, newcomer: Newcomer

@@ -8,60 +8,34 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from compensator.clock import NS, Clock
+from compensator.clock import Clock
 from compensator.config import Config
-from compensator.errors import CompensatorError, ServiceError
+from compensator.errors import ServiceError
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.messages import Candidate, LoopStatus
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop
-from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.found import Found, diagnosed
 from compensator.service.loop.place import role_of
-from compensator.service.loop.process import Diagnose, failed
+from compensator.service.loop.process import Diagnose
 from compensator.service.loop.replaying import FAILED_OUTSIDE
-from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.status import loop_status
-from compensator.service.loop.weighing import Weighed, effect_names
+from compensator.service.loop.weighing import effect_names
 from compensator.service.loop.words import named
-from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.second_opinion import described
-from compensator.service.transfer.turns import give_way
 
 log = logging.getLogger("compensator")
 
-
-@dataclass(slots=True)
-class _Found:
-    """A diagnosis that has ended; and its candidate once it is warmed up, with what it shows on the record."""
-
-    weighed: Weighed
-    text: str
-    warmed: tuple[Compensation, Newcomer] | None = None
-    since: list[Outcome] = field(default_factory=list)
-    why: str = ""
-
-    def catch_up(self) -> tuple[Compensation, Newcomer]:
-        """Return the candidate, which is warmed up, in its state after the last sample."""
-        assert self.warmed is not None
-        compensation, newcomer = self.warmed
-        shadow = Shadow(compensation, b"")
-        for outcome in self.since:
-            missing = outcome.sample.seq - compensation.status.seq - 1
-            if missing < 0:
-                continue
-            if compensation.status.seq >= 0:
-                compensation.pause(missing)
-            newcomer.update(shadow.process(outcome)[1])
-        self.since.clear()
-        return compensation, newcomer
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +103,8 @@ class LiveLoop:
         self._candidates: tuple[Candidate, ...] = ()
         #: The diagnosis or warm-up in progress, and what it gave; a model that is being stored, and why it was not.
         self._task: asyncio.Task[None] | None = None
-        self._found: _Found | None = None
-        self._warming: _Found | None = None
+        self._found: Found | None = None
+        self._warming: Found | None = None
         self._storing: asyncio.Task[None] | None = None
         self._stored, self._not_stored = False, ""
 
@@ -146,42 +120,52 @@ class LiveLoop:
 
     def opening(self) -> Mapping[str, bytes]:
         """Return what a recording that starts with the next sample begins with."""
-        return self._core.attachments() if self._core is not None else {}
+        return self._guarded(ModelLoop.attachments, {}, again=ModelLoop.attachments)
 
     # ------------------------------------------------------------------ between two samples
 
     def before_sample(self, present: Compensation) -> Compensation:
         """Return the compensation for the next sample, after an exchange if one is due."""
-        core = self._core
-        if core is None:
+
+        def again(core: ModelLoop) -> Compensation:
+            core.drop_ended()
+            self._journal.start_new_file()
             return present
+
+        return self._guarded(lambda core: self._changed(core, present), present, again=again)
+
+    def _changed(self, core: ModelLoop, present: Compensation) -> Compensation:
+        """Let what has ended go, what is warmed up begin, and an exchange happen."""
         if core.drop_ended():
             self._journal.start_new_file()
         warmed = self._warming
-        if warmed is not None and warmed.warmed is not None and core.is_free:
+        if warmed is not None and core.is_free:
             self._begin_shadow(core, warmed)
         if not (core.state.exchange and self._stored):
             return present
-        self._stored = False
         new, self._model, note = core.exchange(present, self._model, present.status.time_utc_ns)
+        self._stored = False
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._events.note(*note)
         return new
 
-    def _begin_shadow(self, core: ModelLoop, warmed: _Found) -> None:
+    def _begin_shadow(self, core: ModelLoop, warmed: Found) -> None:
+        ready = warmed.catch_up()
+        if ready is None:
+            return
         self._warming = None
         assert warmed.weighed.candidate is not None
-        compensation, newcomer = warmed.catch_up()
+        compensation, newcomer = ready
         role, now_ns = role_of(warmed.weighed.data), compensation.status.time_utc_ns
         core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, newcomer)
         self._journal.start_new_file()
 
     def hand_over(self, present: Compensation) -> None:
         """Hand over what has reached the loop since the last sample; the events are recorded with the next one."""
-        core, now_ns = self._core, present.status.time_utc_ns
-        if core is None:
-            return
+        self._guarded(lambda core: self._hand_over(core, present.status.time_utc_ns), None)
+
+    def _hand_over(self, core: ModelLoop, now_ns: int) -> None:
         found, self._found = self._found, None
         if found is not None and core.state.diagnosis is not None:
             self._events.note(EventKind.DIAGNOSIS, found.text, found.weighed.data.table())
@@ -189,32 +173,44 @@ class LiveLoop:
             if core.state.diagnosis is not None and found.weighed.candidate is not None:
                 self._warming = found
                 self._task = asyncio.create_task(self._warm_up(found, found.weighed.candidate))
-        if self._warming is not None and self._warming.why:
-            self._end_one(core, "", self._warming.why)
-        if self._warming is not None and self._warming.warmed is not None and core.loop.is_contested:
-            self._note(core.prefer(self._warming.catch_up()[1]))
-            if core.state.diagnosis is None:
-                self._warming = None  # it does not get the place
+        if self._warming is not None:
+            self._weigh(core, self._warming)
         if self._not_stored:
             self._end_not_stored(core)
 
+    def _weigh(self, core: ModelLoop, warming: Found) -> None:
+        """Let the loop decide about what is warmed up."""
+        ready = warming.catch_up()
+        if warming.why:
+            self._end_one(core, "", warming.why)
+        elif ready is not None:
+            self._note(core.prefer(ready[1]))
+            if core.state.diagnosis is None:
+                self._warming = None  # it does not get the place
+
     def resume(self) -> None:
         """Pass on an operator's `resume`."""
-        if self._core is not None:
-            self._core.resume()
+        self._guarded(ModelLoop.resume, None)
 
-    def dismiss(self, present: Compensation) -> None:
-        """End the candidate: an operator's command that acts with the next sample."""
-        if self._core is not None:
-            self._note(self._core.loop.dismiss(present.status.time_utc_ns))
+    def dismiss(self, present: Compensation, sha256: str) -> None:
+        """End a candidate: an operator's command that acts with the next sample.
 
-    def accept(self) -> None:
-        """Adopt the candidate: an operator's command that acts with the next sample."""
-        if self._core is not None:
-            try:
-                self._note(self._core.loop.accept())
-            except ServiceError as error:  # it has ended since the command was received
-                log.info("%s", error)
+        Raises
+        ------
+        ServiceError
+            If it is not there any longer.
+        """
+        self._guarded(lambda core: self._note(core.loop.dismiss(present.status.time_utc_ns, sha256)), None)
+
+    def accept(self, sha256: str) -> None:
+        """Adopt a candidate: an operator's command that acts with the next sample.
+
+        Raises
+        ------
+        ServiceError
+            If it is not there any longer.
+        """
+        self._guarded(lambda core: self._note(core.loop.accept(sha256)), None)
 
     def offer(self, present: Compensation, *, force: bool) -> Offer:
         """Return what an operator would adopt, and by how much the offset would move.
@@ -239,53 +235,83 @@ class LiveLoop:
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""
-        core, self._model = self._core, model
-        if core is None:
-            return
-        self._cancel()
-        core.present = present.model
-        self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
-        core.drop_ended()
+        self._model = model
+
+        def begin_anew(core: ModelLoop) -> None:
+            self._cancel()
+            core.present = present.model
+            self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
+            core.drop_ended()
+
+        self._guarded(begin_anew, None)
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured."""
-        if self._core is not None:
-            self._core.pause(samples)
+        self._guarded(lambda core: core.pause(samples), None)
 
     # ------------------------------------------------------------------ one sample
 
     def process(self, outcome: Outcome) -> tuple[Candidate, ...]:
         """Process a sample after the present compensation; return the records of the models in shadow."""
-        core = self._core
-        if core is None:
-            return ()
-        try:
-            followed = core.process(outcome)
-        except Exception as error:
-            # The shadow is no part of what is published: its defect must neither hold the offset nor stop the service.
-            log.exception("internal error of the model in shadow")
-            followed = self._without_shadow(core, outcome, f"internal error: {type(error).__name__}: {error}")
+
+        def alone(core: ModelLoop) -> Followed:
+            return Followed((), tuple(core.loop.step(outcome, {})))
+
+        # The shadow is no part of what is published: its defect must neither hold the offset nor stop the service.
+        followed = self._guarded(lambda core: core.process(outcome), Followed((), ()), again=alone)
         self._note(followed.notes)
         self._candidates = followed.candidates
         return followed.candidates
 
-    def _without_shadow(self, core: ModelLoop, outcome: Outcome, why: str) -> Followed:
-        """End the shadow, or the loop if that fails too."""
+    def _guarded(
+        self, act: Callable[[ModelLoop], T], otherwise: T, *, again: Callable[[ModelLoop], T] | None = None
+    ) -> T:
+        """Do something with the loop; a defect ends the shadow, or the loop if that fails too, and never a sample.
+
+        Parameters
+        ----------
+        act : callable
+            What is done.
+        otherwise : T
+            Returned without a loop, and after a defect.
+        again : callable, optional
+            What is done after a defect, without a shadow, instead of returning `otherwise`.
+
+        Raises
+        ------
+        ServiceError
+            As `act` does, which is an answer to a person.
+        """
+        core = self._core
+        if core is None:
+            return otherwise
+        try:
+            return act(core)
+        except ServiceError:
+            raise
+        except Exception as error:
+            log.exception("internal error of the loop")
+            why = f"internal error: {type(error).__name__}: {error}"
         try:
             self._give_up(core, why)
-            return Followed((), tuple(core.loop.step(outcome, {})))
+            return again(core) if again is not None else otherwise
         except Exception:
             log.exception("internal error of the loop; it is off until the next start")
-            self._cancel()
-            self._core = None
-            self._journal.start_new_file()
-            return Followed((), ())
+        stored = self._stored
+        self._cancel()
+        self._core, self._stored = None, stored
+        self._journal.start_new_file()
+        self._events.note(*_failed(f"{why}; the loop is off until the next start"))
+        return otherwise
 
     def after_sample(self, outcome: Outcome) -> None:
         """Begin what was decided with a sample that is published."""
         core = self._core
         if self._warming is not None:
             self._warming.since.append(outcome)
+        if self._stored and self._storing is None and not self.is_exchanging:
+            # An exchange that a defect has ended: the next start must find the model that goes on.
+            self._storing = asyncio.create_task(self._store_present())
         if core is None:
             return
         wanted = core.loop.wanted
@@ -310,38 +336,11 @@ class LiveLoop:
     # ------------------------------------------------------------------ tasks
 
     async def _make_diagnosis(self, core: ModelLoop) -> None:
-        wanted = core.loop.wanted
-        assert wanted is not None
-        began_ns = self._clock.utc_ns()
-        try:
-            calibrated = await asyncio.to_thread(self._store.calibrated)
-            found = await self._diagnose(wanted, calibrated)
-            weighed = await asyncio.to_thread(core.weigh, found, calibrated=calibrated)
-        except CompensatorError as error:
-            found = failed(str(error))
-            weighed = core.plain(found)
-        except asyncio.CancelledError:
-            raise
-        except Exception as error:
-            log.exception("internal error of a diagnosis")
-            found = failed(f"internal error: {type(error).__name__}: {error}")
-            weighed = core.plain(found)
-        seconds = (self._clock.utc_ns() - began_ns) / NS
-        self._found, self._task = _Found(weighed.lasting(seconds), found.text), None
+        self._found = await diagnosed(core, self._diagnose, self._store, self._clock)
+        self._task = None
 
-    async def _warm_up(self, found: _Found, data: bytes) -> None:
-        def warmed() -> tuple[Compensation, Newcomer]:
-            model = model_of(self._config, data, source="candidate")
-            way, newcomer = give_way(), Newcomer(model.period_s)
-            ready = warm_up(
-                self._recordings, self._config, model, between_samples=way, probes=True, seen=newcomer.update
-            )
-            return ready.compensation, newcomer
-
-        try:
-            found.warmed = await asyncio.to_thread(warmed)
-        except CompensatorError as error:
-            found.why = f"the candidate cannot be warmed up: {error}"
+    async def _warm_up(self, found: Found, data: bytes) -> None:
+        await found.warm_up(self._recordings, self._config, data)
         self._task = None
 
     async def _store_model(self, core: ModelLoop) -> None:
@@ -361,6 +360,16 @@ class LiveLoop:
             self._stored = True
         except ServiceError as error:
             self._not_stored = str(error)
+        self._storing = None
+
+    async def _store_present(self) -> None:
+        """Store the present model again, after another one was stored that has not replaced it."""
+        name, now_ns = model_of(self._config, self._model, source="present model").name, self._clock.utc_ns()
+        self._stored = False
+        try:
+            await asyncio.to_thread(self._store.adopt, self._model, name=name, time_utc_ns=now_ns, by_loop=True)
+        except ServiceError as error:
+            log.error("the next start uses another model: %s", error)
         self._storing = None
 
     def _cancel(self) -> None:

@@ -25,13 +25,15 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import (
     ADOPTION_H,
     falls,
+    is_asked,
+    keeps_place,
     leads,
     place_of_outgoing,
-    role_of,
+    rival_of,
     takes_over,
     why_nothing,
 )
-from compensator.service.loop.proof import is_clearly_better, is_limited
+from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Exchange, LoopState, Place, PlaceName
@@ -43,9 +45,9 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
-#: Why a newcomer gets the place of a proposed candidate, does not get it, or waits for a person's answer; each with its
-#: comparison with the proposed one.
-BESIDE_PROPOSED = ("replaced", "shown_less", "waits")
+#: Why a newcomer gets the place of a candidate, does not get it, or waits for a person's answer; each with its
+#: comparison with that candidate.
+BESIDE = ("replaced", "shown_less", "waits")
 _HOUR_NS = 3600 * NS
 
 
@@ -130,7 +132,7 @@ class Loop:
                     notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
             else:
                 judge = compared.add(present, others[name])
-            if not state.exchange and not (name == "found" and state.is_replaced):
+            if not state.exchange and not (name == "found" and state.has_next):
                 notes += self._decide(name, place, now_ns, present, others[name], judge=judge)
         return notes + self._schedule(now_ns)
 
@@ -192,10 +194,9 @@ class Loop:
     def _withdraw(
         self, place: Place, text: str, *, why: str = "", comparison: ComparisonData | None = None
     ) -> list[Note]:
-        then = self._begins() if self.is_contested or self.state.is_replaced else []
         place.is_proposed = False
         text = f"the proposal is withdrawn: {text}"
-        return [self._note(place, LoopAction.WITHDRAW, text, why=why, comparison=comparison), *then]
+        return [self._note(place, LoopAction.WITHDRAW, text, why=why, comparison=comparison)]
 
     def _go_back(self, name: PlaceName, place: Place) -> list[Note]:
         self._exchange("back", name, place)
@@ -221,10 +222,7 @@ class Loop:
         state, place = self.state, self.state.place(name)
         if place is None:
             return []
-        is_contested = self.is_contested and place is state.proposed
         notes = [self._note(place, LoopAction.END, text or ended(why, place.verdict), why=why)]
-        if is_contested:
-            notes += self._begins()
         place.begin_anew()
         state.put(name, None)
         if state.incoming == name:
@@ -257,51 +255,43 @@ class Loop:
         return begin_if_due(state, self._settings, now_ns, planned_ns)
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
-        """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
+        """Decide what follows from a diagnosis; a candidate is then warmed up (`prefer`)."""
         state = self.state
         running, state.diagnosis = state.diagnosis, None
         if running is None:
             return []
         why = why_nothing(state, self._settings, found, now_ns)
-        if why:
-            return [nothing_follows(why, found)]
-        state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
-        return [] if self.is_contested else self._begins()
+        if not why:
+            state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
+        return [nothing_follows(why, found)] if why else []
 
-    def _begins(self) -> list[Note]:
-        """Say what begins to run in shadow once it is warmed up."""
-        running = self.state.diagnosis
-        return [begins(running.found)] if running is not None and running.found is not None else []
-
-    @property
-    def is_contested(self) -> bool:
-        """Whether what is warmed up must show itself beside a proposed candidate before it gets its place.
-
-        With the same effects it takes over what that one has shown, unless a person reads the proposal.
-        """
-        state, found = self.state, self.state.diagnosis.found if self.state.diagnosis is not None else None
-        if found is None or state.proposed is None or state.is_replaced or state.exchange:
-            return False
-        return self._settings.policy == "propose" or not takes_over(state, role_of(found), found.effects)
-
-    def prefer(self, beside: ComparisonData) -> list[Note]:
-        """Decide whether a candidate that is warmed up takes the place of the one that is proposed.
+    def prefer(self, beside: ComparisonData | None) -> list[Note]:
+        """Decide whether what is warmed up gets its place before the next sample.
 
         Parameters
         ----------
-        beside : ComparisonData
-            It, compared with the proposed one as the present model (`Newcomer.beside`).
+        beside : ComparisonData, optional
+            It, compared with its rival as the present model (`place.rival_of`, `Newcomer.beside`).
         """
-        state, proposed, running = self.state, self.state.proposed, self.state.diagnosis
-        if proposed is None or running is None or running.found is None or not self.is_contested:
+        state, rival, running = self.state, rival_of(self.state, self._settings), self.state.diagnosis
+        if running is None or running.found is None or running.is_next or state.exchange:
             return []
-        found, is_asked = running.found, self._settings.policy == "propose"
-        if is_clearly_better(beside) and not is_asked:
-            state.diagnosis = msgspec.structs.replace(running, is_preferred=True)
-            return self._withdraw(proposed, replaced(found, beside), why=BESIDE_PROPOSED[0], comparison=beside)
-        state.diagnosis = None
-        # A person who reads a proposal must still find it when answering.
-        return [nothing_follows(BESIDE_PROPOSED[2 if is_asked else 1], found, beside)]
+        found = running.found
+        if rival is None:
+            said = [begins(found)]
+        elif beside is None:
+            return []  # a recording that lacks the figures
+        elif keeps_place(rival, beside, self._settings):
+            state.diagnosis = None
+            why = BESIDE[2 if is_asked(rival, self._settings) else 1]
+            return [nothing_follows(why, found, beside, is_proposed=rival.is_proposed)]
+        elif rival.is_proposed:
+            said = self._withdraw(rival, replaced(found, beside), why=BESIDE[0], comparison=beside)
+            said.append(begins(found))
+        else:
+            said = [begins(found, beside, why=BESIDE[0])]
+        state.diagnosis = msgspec.structs.replace(running, is_next=True)
+        return said
 
     # ------------------------------------------------------------------ between two samples
 
@@ -363,30 +353,51 @@ class Loop:
             place.begin_anew()
             place.since_utc_ns, place.is_proposed = now_ns, False
 
-    def accept(self) -> list[Note]:
+    def accept(self, sha256: str = "") -> list[Note]:
         """Adopt the candidate before the next sample: an operator has agreed.
+
+        Parameters
+        ----------
+        sha256 : str
+            Hash of the candidate that is meant; empty: whichever there is.
 
         Raises
         ------
         ServiceError
-            If there is none.
+            If there is none, or another one.
         """
-        candidate = self.state.candidate
-        if candidate is None:
-            raise ServiceError("adopt --candidate: there is no candidate now; see `compensator watch`")
+        candidate = self._meant(sha256, "adopt --candidate")
         if self.state.exchange:
             return []
         self._exchange("adopt", "found", candidate)
         text = f"an operator adopts the candidate: {_named(candidate)}; {described(candidate.verdict)}"
         return [self._note(candidate, LoopAction.ADOPT, text, why="by_hand")]
 
-    def dismiss(self, now_ns: int) -> list[Note]:
-        """End a candidate: an operator has refused it. Its effects are avoided for some time."""
-        candidate = self.state.candidate
-        if candidate is None or self.state.exchange:
+    def dismiss(self, now_ns: int, sha256: str = "") -> list[Note]:
+        """End a candidate: an operator has refused it. Its effects are avoided for some time.
+
+        Raises
+        ------
+        ServiceError
+            As `accept`.
+        """
+        candidate = self._meant(sha256, "dismiss")
+        if self.state.exchange:
             return []
         avoid(self.state, candidate.effects, now_ns, self._settings.watch_h)
         return self._end("found", "dismissed")
+
+    def _meant(self, sha256: str, command: str) -> Place:
+        """Return the candidate that an operator's answer is about."""
+        candidate = self.state.candidate
+        if candidate is None:
+            raise ServiceError(f"{command}: there is no candidate now; see `compensator watch`")
+        if sha256 and candidate.sha256 != sha256:
+            raise ServiceError(
+                f"{command}: candidate {sha256[:12]} has given its place to {_named(candidate)}; "
+                "see `compensator watch`"
+            )
+        return candidate
 
     def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
         """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""

@@ -1,9 +1,10 @@
-"""A model that a diagnosis has found, on the record before it runs in shadow, and beside a candidate that is proposed.
+"""A model that a diagnosis has found, on the record before it runs in shadow, and beside the candidate that does.
 
-What a proposed candidate has shown on live data is not thrown away for a model that has shown nothing. The newcomer
-gets its place if it explains measured Y clearly better on the same hours, by the rule by which a candidate is adopted:
-both are compared as if the proposed one were the present model. These hours were diagnosed, so the newcomer knows them:
-less than clearly is nothing. A second effect beside the first shows there, and so does the end of the first one.
+What a candidate has shown on live data is not thrown away for a model that is worse. Both are compared on the same
+hours, by the rule by which a candidate is adopted, as if the one in shadow were the present model. These hours were
+diagnosed, so the newcomer knows them: what is clearly worse even there does not get the place, and that of a proposed
+candidate only what is clearly better (`place.keeps_place`). A second effect beside the first shows there, and so does
+the end of the first one.
 """
 
 from __future__ import annotations
@@ -52,21 +53,21 @@ class Newcomer:
         if not (is_unusable(outcome) or is_disturbed(outcome.offset.reasons)):
             self._alone.add(outcome, outcome, suspected=False)
 
-    def beside(self, proposed: Place, settings: LoopSettings) -> ComparisonData:
-        """Compare the newcomer with a proposed candidate, as if that were the present model.
+    def beside(self, rival: Place, settings: LoopSettings) -> ComparisonData:
+        """Compare the newcomer with a candidate, as if that were the present model.
 
-        On the hours of its comparison, or, where only that shows the newcomer, since the proposed one errs otherwise:
-        an effect that has ended has acted in the hours before.
+        On the hours of its comparison, or, where only that shows the newcomer, since that one errs otherwise: an effect
+        that has ended has acted in the hours before.
         """
-        whole = self._since(0, proposed, settings)
-        since_ns = _erring_since(proposed)
+        whole = self._since(0, rival, settings)
+        since_ns = _erring_since(rival)
         if since_ns is None or is_clearly_better(whole):
             return whole
-        last = self._since(since_ns, proposed, settings)
+        last = self._since(since_ns, rival, settings)
         return last if is_clearly_better(last) else whole
 
-    def _since(self, from_ns: int, proposed: Place, settings: LoopSettings) -> ComparisonData:
-        shown, own = proposed.comparison, self._alone.state
+    def _since(self, from_ns: int, rival: Place, settings: LoopSettings) -> ComparisonData:
+        shown, own = rival.comparison, self._alone.state
         before = {block.number: block for block in shown.blocks if block.number * BLOCK_NS >= from_ns}
         zeros: dict[tuple[int, int], int] = {}
         blocks = []

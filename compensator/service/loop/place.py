@@ -1,6 +1,7 @@
 """Which of the two places beside the present model a model gets, and what follows from a diagnosis.
 
-What a diagnosis finds gives its place to what a later one finds, which knows more, but for a proposal (`newcomer`).
+What a diagnosis finds gives its place to what a later one finds, which knows more, but not to what is worse on the same
+hours (`newcomer`); a proposal is held more firmly.
 The model before an adoption has a place of its own for as long as it is watched: the way back does not depend on what
 is found meanwhile.
 """
@@ -11,11 +12,11 @@ from collections.abc import Sequence
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, DiagnosisData
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
-from compensator.service.loop.proof import BETTER_PART
+from compensator.service.loop.proof import BETTER_PART, is_clearly_better
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, PlaceName
+from compensator.service.loop.state import LoopState, Place, PlaceName
 
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
@@ -54,8 +55,7 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
-    # A person who reads a proposal must still find it when answering: whatever is newer comes after the answer.
-    if settings.policy == "propose" and state.candidate is not None and state.candidate.is_proposed:
+    if state.candidate is not None and is_asked(state.candidate, settings):
         return "in_shadow" if takes_over(state, role, found.effects) else "waits"
     if takes_over(state, role, found.effects):
         assert state.candidate is not None
@@ -70,6 +70,37 @@ def takes_over(state: LoopState, role: Role, effects: Sequence[str]) -> bool:
     if candidate is None or role != "candidate":
         return False
     return not state.exchange and sorted(candidate.effects) == sorted(effects)
+
+
+def is_asked(candidate: Place, settings: LoopSettings) -> bool:
+    """Return whether a person reads the proposal of a candidate.
+
+    It must still be there at the answer: whatever is newer comes after it.
+    """
+    return candidate.is_proposed and settings.policy == "propose"
+
+
+def rival_of(state: LoopState, settings: LoopSettings) -> Place | None:
+    """Return the candidate beside which what a diagnosis has found must show itself; None if it just gets the place.
+
+    With the same effects it takes over what that one has shown, unless a person reads the proposal.
+    """
+    found, candidate = state.diagnosis.found if state.diagnosis is not None else None, state.candidate
+    if found is None or candidate is None:
+        return None
+    if takes_over(state, role_of(found), found.effects) and not is_asked(candidate, settings):
+        return None
+    return candidate
+
+
+def keeps_place(candidate: Place, beside: ComparisonData, settings: LoopSettings) -> bool:
+    """Return whether a candidate keeps its place against what is compared with it as the present model.
+
+    A proposed one gives it to what is clearly better, another one to all that is not clearly worse.
+    """
+    if candidate.is_proposed:
+        return is_asked(candidate, settings) or not is_clearly_better(beside)
+    return beside.verdict == ComparisonVerdict.WORSE
 
 
 def place_of_outgoing(state: LoopState, effects: Sequence[str], adopted: Sequence[str]) -> PlaceName:

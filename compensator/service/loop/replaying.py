@@ -10,7 +10,7 @@ from compensator.messages import Event
 from compensator.recording.container import Contents
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
-from compensator.service.loop.loop import BESIDE_PROPOSED
+from compensator.service.loop.loop import BESIDE
 from compensator.service.replay import RecordedStep, setup_of
 
 #: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
@@ -62,23 +62,31 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
     if event.kind == EventKind.COMMAND:
         name = command_of(event)
         if name == CommandName.DISMISS:
-            return core.loop.dismiss(now_ns)
+            with suppress(ServiceError):
+                return core.loop.dismiss(now_ns, _meant(event))
         if name == CommandName.RESUME:
             core.resume()
         elif name == CommandName.ADOPT and event.data.get("candidate") is True:
             with suppress(ServiceError):
-                return core.loop.accept()
+                return core.loop.accept(_meant(event))
     elif event.kind == EventKind.DIAGNOSIS:
         found = data_of(event, DiagnosisData)
         return core.receive(found, now_ns) if found is not None else []
     elif event.kind == EventKind.LOOP:
         data = data_of(event, LoopData)
-        if data is not None and data.comparison is not None and data.why in BESIDE_PROPOSED:
-            # How a newcomer compares with what is proposed comes from its warm-up: an input, as a diagnosis is.
+        is_beside = data is not None and data.comparison is not None and data.why in BESIDE
+        if data is not None and (is_beside or data.step == LoopAction.SHADOW):
+            # When a warm-up ends, and how the newcomer compares with the candidate, are inputs, as a diagnosis is.
             return core.loop.prefer(data.comparison)
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
             core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
     return []
+
+
+def _meant(event: Event) -> str:
+    """Return the hash of the candidate that an answer was about; empty in recordings without it."""
+    sha256 = event.data.get("sha256", "")
+    return sha256 if isinstance(sha256, str) else ""
 
 
 def recorded_loop(contents: Contents, compensation: Compensation, file: str) -> RecordedLoop | None:

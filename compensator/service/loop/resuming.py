@@ -7,6 +7,7 @@ ends; what was adopted and gone back from stays known.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from compensator.service.loop.replaying import RecordedLoop, recorded_loop
 from compensator.service.loop.weighing import effect_names
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
 from compensator.service.transfer.restart import Resumed
+
+log = logging.getLogger("compensator")
 
 
 @dataclass(slots=True)
@@ -48,6 +51,11 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
         last = _replayed(config, loaded.resolve(config.recording.folder))
     except CompensatorError as error:
         resumed.note(f"the loop starts again without its state: {error}")
+        last = None
+    except Exception as error:
+        # No defect of the loop may keep the service from starting.
+        log.exception("internal error of the loop at the start")
+        resumed.note(f"the loop starts again without its state: internal error: {type(error).__name__}: {error}")
         last = None
     if last is None:
         return ModelLoop(config, present.model, {})

@@ -148,7 +148,13 @@ class LoopRun:
         self._notes += self._core.loop.accept()
 
     def dismiss(self) -> None:
-        """End the candidate, as an operator can; the event comes with the next sample."""
+        """End the candidate, as an operator can; the event comes with the next sample.
+
+        Raises
+        ------
+        ServiceError
+            If there is none.
+        """
         self._notes += self._core.loop.dismiss(self._compensation.status.time_utc_ns)
 
     # ------------------------------------------------------------------ state

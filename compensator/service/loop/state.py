@@ -26,7 +26,7 @@ NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.
 class Running(msgspec.Struct, frozen=True, kw_only=True):
     """A diagnosis: what is diagnosed, why, how often it was begun, and whether its candidate is being warmed up.
 
-    `found` is its result then. `is_preferred`: the candidate takes the place of a proposed one before the next sample.
+    `found` is its result then. `is_next`: the candidate gets its place before the next sample.
     """
 
     from_utc_ns: int
@@ -35,7 +35,7 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     attempts: int = 1
     candidate_sha256: str = ""
     found: DiagnosisData | None = None
-    is_preferred: bool = False
+    is_next: bool = False
 
 
 class Place(msgspec.Struct, kw_only=True):
@@ -159,9 +159,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         return self.candidate if self.candidate is not None and self.candidate.is_proposed else None
 
     @property
-    def is_replaced(self) -> bool:
-        """Whether the candidate gives its place to another one before the next sample."""
-        return self.diagnosis is not None and self.diagnosis.is_preferred
+    def has_next(self) -> bool:
+        """Whether what a diagnosis has found gets its place before the next sample."""
+        return self.diagnosis is not None and self.diagnosis.is_next
 
     @property
     def shown(self) -> Place | None:

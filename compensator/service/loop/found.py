@@ -1,0 +1,112 @@
+"""A diagnosis that has ended, and its candidate while it is warmed up on the recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from compensator.clock import NS, Clock
+from compensator.config import Config
+from compensator.errors import CompensatorError
+from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.process import Diagnose, failed
+from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.weighing import Weighed
+from compensator.service.transfer.candidate import warm_up
+from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.turns import give_way
+
+log = logging.getLogger("compensator")
+
+
+@dataclass(slots=True)
+class Found:
+    """A diagnosis that has ended; and its candidate once it is warmed up, with what it shows on the record.
+
+    Parameters
+    ----------
+    weighed : Weighed
+        The diagnosis, and what follows from it.
+    text : str
+        One sentence for people.
+    warmed : tuple of Compensation and Newcomer, optional
+        The candidate once it is warmed up.
+    since : list of Outcome
+        Live samples since the warm-up began.
+    why : str
+        Why the candidate cannot be used; empty if it can.
+    """
+
+    weighed: Weighed
+    text: str
+    warmed: tuple[Compensation, Newcomer] | None = None
+    since: list[Outcome] = field(default_factory=list)
+    why: str = ""
+
+    async def warm_up(self, recordings: Path, config: Config, data: bytes) -> None:
+        """Warm the candidate up; `why` says why it cannot be."""
+
+        def warmed() -> tuple[Compensation, Newcomer]:
+            model = model_of(config, data, source="candidate")
+            newcomer = Newcomer(model.period_s)
+            ready = warm_up(recordings, config, model, between_samples=give_way(), probes=True, seen=newcomer.update)
+            return ready.compensation, newcomer
+
+        try:
+            self.warmed = await asyncio.to_thread(warmed)
+        except CompensatorError as error:
+            self.why = f"the candidate cannot be warmed up: {error}"
+        except Exception as error:
+            log.exception("internal error in a warm-up")
+            self.why = _internal(error)
+
+    def catch_up(self) -> tuple[Compensation, Newcomer] | None:
+        """Return the candidate in its state after the last sample; None if it is not warmed up, or cannot be used."""
+        if self.warmed is None or self.why:
+            return None
+        compensation, newcomer = self.warmed
+        shadow = Shadow(compensation, b"")
+        try:
+            for outcome in self.since:
+                missing = outcome.sample.seq - compensation.status.seq - 1
+                if missing < 0:
+                    continue
+                if compensation.status.seq >= 0:
+                    compensation.pause(missing)
+                newcomer.update(shadow.process(outcome)[1])
+        except Exception as error:
+            # What runs in shadow already goes on.
+            log.exception("internal error in a warm-up")
+            self.why = _internal(error)
+            return None
+        self.since.clear()
+        return compensation, newcomer
+
+
+async def diagnosed(core: ModelLoop, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:
+    """Make the diagnosis that the loop wants; what goes wrong is a diagnosis that failed."""
+    wanted = core.loop.wanted
+    assert wanted is not None
+    began_ns = clock.utc_ns()
+    try:
+        calibrated = await asyncio.to_thread(store.calibrated)
+        found = await diagnose(wanted, calibrated)
+        weighed = await asyncio.to_thread(core.weigh, found, calibrated=calibrated)
+    except CompensatorError as error:
+        found = failed(str(error))
+        weighed = core.plain(found)
+    except asyncio.CancelledError:
+        raise
+    except Exception as error:
+        log.exception("internal error of a diagnosis")
+        found = failed(f"internal error: {type(error).__name__}: {error}")
+        weighed = core.plain(found)
+    return Found(weighed.lasting((clock.utc_ns() - began_ns) / NS), found.text)
+
+
+def _internal(error: Exception) -> str:
+    return f"internal error in the warm-up of the candidate: {type(error).__name__}: {error}"

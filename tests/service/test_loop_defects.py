@@ -1,0 +1,125 @@
+"""A defect of the loop ends the shadow, never a sample, wherever it happens, and its cause is recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.loop import Loop
+from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.shadow import Shadow
+from compensator.service.transfer.model_store import sha256_of
+from tests.service.looping import extended, shown, stronger
+from tests.service.test_loop_contested import Early
+from tests.service.test_loop_service import Asked, Looping, checked
+from tests.service.test_restart import QUILL
+
+
+class Breaks:
+    """Stands in for a method: raises the first time that it is called, or each time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: type, name: str, *, always: bool = False) -> None:
+        self.calls = 0
+        works = getattr(owner, name)
+
+        def broken(*arguments: Any, **settings: Any) -> Any:
+            self.calls += 1
+            if always or self.calls == 1:
+                raise ZeroDivisionError("a defect")
+            return works(*arguments, **settings)
+
+        monkeypatch.setattr(owner, name, broken)
+
+
+def unharmed(machine: Looping, samples: int) -> None:
+    """Every sample is decided by the model that was calibrated, and the next start finds that one."""
+    assert len(machine.outcomes) == samples
+    assert {outcome.offset.state for outcome in machine.outcomes[-60:]} == {"ok"}
+    assert {outcome.offset.model_sha256 for outcome in machine.outcomes} == {sha256_of(QUILL)}
+    assert machine.store.in_use() == machine.store.calibrated() == QUILL
+    assert not any("internal_error" in outcome.offset.reasons for outcome in machine.outcomes)
+
+
+def said(machine: Looping) -> str:
+    """Return what is said about the end."""
+    assert machine.steps()[-1] == ("end", "failed"), machine.steps()
+    return str(machine.events("loop")[-1].text)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [(Loop, "receive"), (Loop, "prefer"), (ModelLoop, "begin_shadow"), (Newcomer, "update"), (Loop, "shadow_begins")],
+)
+async def test_between_two_samples_and_in_a_warm_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
+) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    broken = Breaks(monkeypatch, owner, name)
+    await machine.run(420)
+    assert broken.calls and "ZeroDivisionError: a defect" in said(machine)
+    monkeypatch.undo()
+    unharmed(machine, 420)
+    if name != "receive":  # a replay meets a defect of the rules, too
+        checked(machine)
+
+
+async def test_at_an_exchange_whose_model_is_stored_already(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    broken = Breaks(monkeypatch, Loop, "exchanged")
+    await machine.run(960, until=lambda _: bool(broken.calls))
+    await machine.run(60)
+    assert machine.steps()[-2] == ("adopt", "") and "a defect" in said(machine)
+    unharmed(machine, len(machine.outcomes))
+    checked(machine)
+
+
+async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Early(tmp_path, shown(extended()), shown(stronger(0.1)), acts=lambda i: 0.5)
+    await machine.run(480)
+    broken = Breaks(monkeypatch, Newcomer, "update")
+    await machine.run(600, until=lambda _: bool(broken.calls))
+    await machine.run(60)
+    assert "in the warm-up of the candidate" in said(machine)
+    assert machine.candidates()[-1].model_sha256 == sha256_of(extended())
+    unharmed(machine, len(machine.outcomes))
+    checked(machine)
+
+
+async def test_at_an_operators_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    machine.at_sample[420] = Asked(machine, "dismiss")
+    broken = Breaks(monkeypatch, Loop, "dismiss")
+    await machine.run(480)
+    assert broken.calls and "a defect" in said(machine)
+    unharmed(machine, 480)
+
+
+async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+
+    def breaks() -> None:
+        Breaks(monkeypatch, Shadow, "process", always=True)
+        Breaks(monkeypatch, Loop, "give_up", always=True)
+
+    machine.at_sample[420] = breaks
+    await machine.run(480)
+    monkeypatch.undo()
+    assert said(machine).endswith("the loop is off until the next start")
+    unharmed(machine, 480)
+
+
+async def test_at_the_start_of_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(420)
+    broken = Breaks(monkeypatch, ModelLoop, "process")
+    await machine.run(60)
+    assert broken.calls > 1
+    assert any("without its state: internal error: ZeroDiv" in event.text for event in machine.events("restart"))
+    monkeypatch.undo()
+    unharmed(machine, 480)
+    checked(machine)
