@@ -13,7 +13,7 @@ from compensator.arrays import Mask, Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
+from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import Search, Selection
@@ -118,7 +118,10 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
     ceiling = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
-    remainder, explains = (None, True) if late_term(fit) else _remainder(search, fit, background, refitted, ceiling)
+    if late_term(fit):
+        remainder, explains = _beside_late(fit), True
+    else:
+        remainder, explains = _remainder(search, fit, background, refitted, ceiling)
     belongs = remainder is None and _has_own_error(fit)
     fit = foretelling(fit) if belongs else fit
     terms, responses, beside = as_deployed(fit)
@@ -176,11 +179,26 @@ def _remainder(
     charge = search.criterion.charge(fit) + WORTH if evidence.free_paths else 0.0
     if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - charge:
         return ceiling, False
+    return beside if _is_worth_deploying(beside, known, evidence) else None, True
+
+
+def _beside_late(fit: Fit) -> Regressed | None:
+    """Return what all channels explain where a late T_Q is corrected as the engine does, if that is worth deploying.
+
+    What a dead time hides from T_Q another channel may show at once. The correction stays: others get its signals.
+    """
+    _, _, corrected = as_deployed(fit)
+    alone = settled(corrected)
+    points = alone.likelihood.points
+    beside = Background(points.evidence).fitted(points, alone.added, alone.rest)
+    return beside if _is_worth_deploying(beside, _log_evidence(alone), points.evidence) else None
+
+
+def _is_worth_deploying(beside: Regressed, known: float, evidence: Evidence) -> bool:
+    """Return whether a remainder adds enough to the logarithm of the evidence, `known` without it, and to y."""
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)
-    if beside.log_evidence > known + WORTH and size > least:
-        return beside, True
-    return None, True
+    return beside.log_evidence > known + WORTH and size > least
 
 
 def _log_evidence(fit: Fit) -> float:

@@ -19,6 +19,9 @@ from compensator.model.effects.hypothesis import Free, Hypothesis, Place
 
 Start = tuple[Hypothesis, Sequence[float]]
 
+#: A free parameter is at its lower bound where this share of its range is between them.
+_AT_BOUND = 1e-6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
@@ -225,7 +228,9 @@ def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: i
         found = least_squares(
             problem.fun, inside, bounds=(low, high), diff_step=1e-3, xtol=1e-5, ftol=1e-4, max_nfev=evaluations
         )
-        x, jacobian = np.asarray(found.x), np.asarray(found.jac)[: likelihood.target.size]
+        # The solver stays inside: a dead time of a femtosecond is none.
+        x = np.where(found.x - low < _AT_BOUND * ranges, low, found.x)
+        jacobian = np.asarray(found.jac)[: likelihood.target.size]
     residual, amplitudes, precision = problem.solve(x)
     return _fitted(problem, x, (residual, amplitudes, precision), jacobian * ranges)
 
