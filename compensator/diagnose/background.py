@@ -27,6 +27,8 @@ from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, 
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
 LAGS_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0)
+#: Those of a response to the last minutes alone: the gains of a channel add up to zero.
+RECENT_MIN = (0.0, 4.0, 12.0, 35.0)
 #: Standard deviation of the logarithm of a channel's size about their mean: nearly one size for all.
 ALIKE = 0.2
 #: Typical size of a channel, as a share of the deformation's spread.
@@ -68,17 +70,21 @@ class Background:
         Residual and signals.
     channels : bool
         Whether channels act, or only the base's own paths.
+    recent : bool
+        Whether only channels act, and only by what they have shown in the last minutes.
     """
 
-    def __init__(self, evidence: Evidence, *, channels: bool = True) -> None:
+    def __init__(self, evidence: Evidence, *, channels: bool = True, recent: bool = False) -> None:
         context = evidence.context
         base = [DRIVE["heat" if context.has_ttf else "direct"], *([AMBIENT] if context.has_ambient else [])]
         inputs = [(name, 1.0) for name in base]
         if channels:
             inputs += [(name, 1.0) for name in context.channels]
             inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
-        inputs = inputs[:MOST_CHANNELS]
+        paths = 0 if recent else len(base)
+        inputs = inputs[len(base) - paths :][:MOST_CHANNELS]
         taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0) if channels else lags_of_paths(context)
+        taus = RECENT_MIN if recent else taus
         self.template = Regression(
             channels=tuple(name for name, _ in inputs),
             exponents=tuple(exponent for _, exponent in inputs),
@@ -87,10 +93,16 @@ class Background:
             std_factor=(),
         )
         blocks = self.template.blocks(context.period_min)
-        self.columns = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
-        self.groups = np.repeat(np.arange(len(inputs)), len(taus))
+        of_gains = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
+        #: The gains of the free weights, and the columns of these.
+        self.made_of = np.eye(of_gains.shape[1])
+        if recent:
+            self.made_of = np.kron(np.eye(len(inputs)), np.vstack([np.eye(len(taus) - 1), -np.ones(len(taus) - 1)]))
+        self.columns = of_gains @ self.made_of
+        self._of_gains = of_gains
+        self.groups = np.repeat(np.arange(len(inputs)), len(taus) - recent)
         # The sizes of the base's own paths are known apart from those of channels.
-        self.is_path = np.arange(len(inputs)) < len(base)
+        self.is_path = np.arange(len(inputs)) < paths
 
     def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
         """Fit to what named effects leave.
@@ -110,7 +122,11 @@ class Background:
 
     def response(self, effect: Regression) -> Vector:
         """Return what a regression over these channels adds to y on every sample, µm."""
-        return np.asarray(self.columns @ np.ravel(effect.gains))
+        return np.asarray(self._of_gains @ np.ravel(effect.gains))
+
+    def directions(self, points: Points, root: Matrix) -> tuple[tuple[float, ...], ...]:
+        """Return what the data leave open of the gains, from a root of the covariance of the free weights."""
+        return strongest(self.made_of @ root, points.averaged(self._of_gains))
 
 
 class _Problem:
@@ -192,10 +208,13 @@ class _Problem:
         gains = (np.linalg.solve(gram, white.T @ target)[self._fixed :]) * weights
         sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
-        seen = self.table * np.where(np.isfinite(self.scale), self.scale, 0.0)
-        template, lags = self.background.template, len(self.background.template.taus_min)
+        background = self.background
         effect = dataclasses.replace(
-            template, gains=tuple(map(tuple, gains.reshape(-1, lags).tolist())), std_factor=strongest(root, seen)
+            background.template,
+            gains=tuple(
+                map(tuple, (background.made_of @ gains).reshape(-1, len(background.template.taus_min)).tolist())
+            ),
+            std_factor=background.directions(self.points, root),
         )
         return Regressed(
             effect=effect,

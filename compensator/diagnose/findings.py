@@ -187,10 +187,12 @@ def _beside_late(fit: Fit) -> Regressed | None:
 
     What a dead time hides from T_Q another channel may show at once. The correction stays: others get its signals.
     """
+    if not fit.likelihood.points.evidence.context.channels:
+        return None
     _, _, corrected = as_deployed(fit)
     alone = settled(corrected)
     points = alone.likelihood.points
-    beside = Background(points.evidence).fitted(points, alone.added, alone.rest)
+    beside = Background(points.evidence, recent=True).fitted(points, alone.added, alone.rest)
     return beside if _is_worth_deploying(beside, _log_evidence(alone), points.evidence) else None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -9,7 +11,12 @@ from scipy.signal import lfilter
 from compensator.data.runs import Run
 from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.points import Points
 from compensator.identify.calibration import predict
+from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
@@ -69,6 +76,38 @@ def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: flo
     left_um = np.sqrt(error(found.model, run, run.y_um))
     assert found.after.rms_um == pytest.approx(left_um, rel=0.1)
     assert effect.rms_after_um == pytest.approx(left_um, rel=0.1)
+
+
+def test_what_a_dead_time_hides_another_channel_shows() -> None:
+    """The remainder corrects the minutes in which T_Q cannot know of the heat, where the motor's power is logged."""
+    late = sensor(0.0, 12.0)
+
+    def with_power(seed: int, hours: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        columns, true, _ = record([late], seed, hours)
+        kept = {name: columns[name] for name in ("t_q_degc", "at_degc", "y_um")}
+        noise_w = np.random.default_rng(seed).normal(0.0, 2.0, true.size)
+        return kept | {"motor_w": 4.0 * signals(seed, hours)[2] + noise_w}, true
+
+    found = diagnose(QUILL, runs_from(with_power(1106, 36.0)[0]))
+    [effect] = found.effects
+    assert effect.place == PLACE
+    assert found.remainder is not None and found.remainder.deployed and found.remainder.channels == ("motor_w",)
+    fresh, true = with_power(5106, 24.0)
+    [run] = runs_from(fresh)
+    deployed = parse_model(dump_model(found.model).encode(), source="model.toml")
+    corrected = dataclasses.replace(deployed, effects=(effect.effect,))
+    assert error(deployed, run, true) < 0.6 * error(corrected, run, true)
+
+
+def test_no_dead_time_is_none() -> None:
+    """The search of a lag and a dead time stays a little inside its bounds."""
+    columns, _, _ = record([sensor(6.0, 0.0)], 1107, 36.0)
+    evidence = evidence_of(QUILL, runs_from(columns))
+    both = next(h for h in proposals(evidence.context) if h.place == PLACE and h.form == "path, dead time and lag")
+    points = Points(evidence)
+    fit = fit_terms(Likelihood(points, points.typical_rest()), [(both, (0.5, 4.0))])
+    assert fit.terms[0].named["delay_min"] == 0.0
+    assert fit.terms[0].named["lag_min"] == pytest.approx(6.0, abs=0.5)
 
 
 def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
