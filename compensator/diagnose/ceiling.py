@@ -61,7 +61,10 @@ def ceiling(found: Mapping[str, Any]) -> Words:
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
     if (best := found.get("ceiling")) is None:
-        return ["Nothing that was tried has a smaller error on held-out data than the base model."]
+        return [
+            "No linear combination of the logged channels, and nothing that was found, has a smaller error on held-out "
+            "data than the base model."
+        ]
     lines = [_of_all(found, best)]
     if not (share := explained(found)):
         return [*lines, "The channels can explain almost nothing of the error."]

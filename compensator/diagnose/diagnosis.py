@@ -110,6 +110,7 @@ def diagnose(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
         effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, start_k=evidence.start_k
     )
@@ -119,9 +120,7 @@ def diagnose(
         held_out=how_held_out(evidence),
         model=extended,
         evidence=evidence,
-        residual_before=np.where(
-            evidence.used, found.search.criterion.left(found.selection.before) - found.paths, np.nan
-        ),
+        residual_before=np.where(evidence.used, evidence.without_nuisances(before), np.nan),
         residual_after=np.where(evidence.used, left, np.nan),
         paths_um=found.own_paths - found.paths,
         remainder_um=found.whole - found.named,
