@@ -61,9 +61,10 @@ def ceiling(found: Mapping[str, Any]) -> Words:
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
     if (best := found.get("ceiling")) is None:
+        found_too = ", and nothing that was found," if found["effects"] or found.get("remainder") else ""
         return [
-            "No linear combination of the logged channels, and nothing that was found, has a smaller error on held-out "
-            "data than the base model."
+            f"No linear combination of the logged channels{found_too} has a smaller error on held-out data than the "
+            "base model."
         ]
     lines = [_of_all(found, best)]
     if not (share := explained(found)):

@@ -118,7 +118,7 @@ class FoundEffect:
         if self.effect.has_any_form:
             return True
         sized = [name for name in self.term.hypothesis.amplitudes if name in self.named] or list(self.named)
-        return any(abs(self.named[name]) >= self.std[name] for name in sized)
+        return not sized or any(abs(self.named[name]) >= self.std[name] for name in sized)
 
     @property
     def reverses_path(self) -> bool:
