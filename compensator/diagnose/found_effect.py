@@ -17,6 +17,7 @@ from compensator.diagnose.fit import Term
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
+from compensator.model.effects.input import NEEDS_CHANNEL
 from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
@@ -102,7 +103,8 @@ class FoundEffect:
     @property
     def explanation(self) -> str:
         """For an engineer."""
-        return self.effect.explanation + (REPLACED if self.replaced else "")
+        words = self.effect.explanation
+        return words.replace(NEEDS_CHANNEL, "") + REPLACED if self.replaced else words
 
     @property
     def deployable(self) -> bool:

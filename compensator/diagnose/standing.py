@@ -111,13 +111,13 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
     rest, fit = found.get("remainder"), found.get("fit")
     if not rest or not rest["deployed"] or not fit or found["verdict"] == "explained":
         return ""
-    left = f"of {fit['before_um']:.2f} µm rms in the fit, the effects leave {fit['named_um']:.2f}"
+    left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
     if rest.get("instead"):
         return (
-            f"Named are the effects that resemble the cause most ({left}). All channels together make the data more "
-            f"probable: the remainder, which explains nothing, is deployed in their place ({fit['after_um']:.2f})."
+            f"What is named resembles the cause most: {left}. All channels together make the data more probable: the "
+            f"remainder, which explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
         )
     return (
-        f"Some of the missing effects were found: {left}. The rest is corrected by the remainder, which explains "
-        f"nothing ({fit['after_um']:.2f} with it)."
+        f"What was found explains the error in part: {left}. The remainder, which explains nothing, corrects that to "
+        f"{fit['after_um']:.2f}."
     )

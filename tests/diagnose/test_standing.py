@@ -101,11 +101,12 @@ def test_where_the_remainder_does_the_work_it_is_said() -> None:
     fit = {"before_um": 5.62, "named_um": 2.28, "after_um": 0.16}
     table = found(fresh(5.0, 0.2), verdict="partly_explained", remainder=rest, fit=fit)
     words = headline(table)
-    assert "5.62 µm rms in the fit, the effects leave 2.28" in words and "explains nothing (0.16 with it)" in words
+    assert "of 5.62 µm rms in the fit, 2.28 is left by it" in words
+    assert "explains nothing, corrects that to 0.16." in words and "were found" not in words
     assert tone_of(table) == "warn"
     assert "they hold only with it" in remainder(table)[0].text()
     other = found(verdict="partly_explained", remainder=rest | {"instead": True}, fit=fit)
-    assert "in their place" in headline(other)
+    assert "is deployed in its place" in headline(other)
 
 
 def test_a_remainder_that_increases_the_held_out_error_says_so_and_why_it_is_deployed() -> None:
