@@ -113,13 +113,15 @@ class FoundEffect:
 
     @property
     def is_determined(self) -> bool:
-        """Whether its size is known: one of its amplitudes, or where it has none of its parameters, exceeds its error.
+        """Whether its size is known: one of its sizes, or where it has none of its parameters, exceeds its error.
 
-        A response of any form is known by its course; its gain at rest may be open all the same.
+        Lags near each other share one response: their sum is a size, too. A response of any form is known by its course;
+        its gain at rest may be open all the same.
         """
         if self.effect.has_any_form:
             return True
-        sized = [name for name in self.term.hypothesis.amplitudes if name in self.named] or list(self.named)
+        searched = {free.name for free in self.term.hypothesis.free}
+        sized = [name for name in self.named if name not in searched] or list(self.named)
         return not sized or any(abs(self.named[name]) >= self.std[name] for name in sized)
 
     @property

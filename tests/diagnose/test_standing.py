@@ -17,6 +17,10 @@ from compensator.diagnose.summary import headline
 from compensator.report.diagnosis import tone_of
 
 
+#: Errors of two gains that are known only together.
+FAR = {"gain 1": 30.0, "gain 2": 30.0}
+
+
 def fresh(base: float, own: float, *, zero: float = 0.0) -> dict[str, Any]:
     """Errors of both models on a run that took no part, about the mean; a constant comes on top about the zero."""
     scores = {
@@ -160,12 +164,14 @@ def test_a_rival_is_as_good_by_the_figure_and_the_evidence_of_the_choice() -> No
         ({"tau": 9.0, "gain": 1.0}, {"tau": 12.0, "gain": 0.1}, True),
         ({"tau": 9.0, "gain": 0.1}, {"tau": 1.0, "gain": 0.2}, False),
         ({"tau": 9.0, "gain 1": 0.1, "gain 2": 4.0}, {"tau": 1.0, "gain 1": 0.2, "gain 2": 1.0}, True),
+        # Lags near each other: each gain is open, their sum is known.
+        ({"tau": 9.0, "gain": 2.0, "gain 1": 9.0, "gain 2": -7.0}, {"tau": 1.0, "gain": 0.1, **FAR}, True),
     ],
 )
 def test_an_effect_is_determined_by_its_size(named: dict[str, float], std: dict[str, float], known: bool) -> None:
-    amplitudes = tuple(name for name in named if name != "tau")
+    searched = (SimpleNamespace(name="tau"),)
     effect = FoundEffect(
-        term=SimpleNamespace(hypothesis=SimpleNamespace(amplitudes=amplitudes), named=named),  # type: ignore[arg-type]
+        term=SimpleNamespace(hypothesis=SimpleNamespace(free=searched), named=named),  # type: ignore[arg-type]
         effect=SimpleNamespace(has_any_form=False, std=std),  # type: ignore[arg-type]
         rms_before_um=1.0,
         rms_after_um=0.2,

@@ -242,7 +242,7 @@ def test_the_headline_is_the_verdict_and_one_figure(found: Diagnosis) -> None:
 def drawn_term(kind: str) -> Any:
     places = {"step": ("step", "", ""), "gain": ("gain", "DTF", "")}
     return SimpleNamespace(
-        hypothesis=SimpleNamespace(place=places[kind], form="", amplitudes=(), label=kind), named={}, effect=None
+        hypothesis=SimpleNamespace(place=places[kind], form="", free=(), label=kind), named={}, effect=None
     )
 
 
