@@ -115,8 +115,8 @@ class FoundEffect:
     def is_determined(self) -> bool:
         """Whether its size is known: one of its sizes, or where it has none of its parameters, exceeds its error.
 
-        Lags near each other share one response: their sum is a size, too. A response of any form is known by its course;
-        its gain at rest may be open all the same.
+        Lags near each other share one response: their sum is a size, too. A response of any form is known by its
+        course; its gain at rest may be open all the same.
         """
         if self.effect.has_any_form:
             return True

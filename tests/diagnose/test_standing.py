@@ -16,7 +16,6 @@ from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import headline
 from compensator.report.diagnosis import tone_of
 
-
 #: Errors of two gains that are known only together.
 FAR = {"gain 1": 30.0, "gain 2": 30.0}
 
