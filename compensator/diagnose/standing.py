@@ -66,7 +66,7 @@ def undecided(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def is_in_the_model(found: Mapping[str, Any]) -> bool:
     """Whether any of the effects can be deployed."""
-    return any(effect["deployable"] for effect in found["effects"])
+    return any(effect.get("deployable", True) for effect in found["effects"])
 
 
 def words(found: Mapping[str, Any]) -> str:
