@@ -31,6 +31,7 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.series import series_of
+from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError
@@ -127,7 +128,9 @@ class DiagnosisResult(_DiagnosisFiles):
     @property
     def verdict(self) -> str:
         """`adequate`, `explained`, `partly_explained`, or `unexplained`."""
-        return self.diagnosis.verdict
+        return verdict_of(
+            self.diagnosis.verdict, [one.to_dict() for one in self.free_run], self.diagnosis.noise_floor_um
+        )
 
     @property
     def sha256(self) -> str:

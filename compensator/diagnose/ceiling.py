@@ -12,8 +12,6 @@ from compensator.display import Words
 SHORT_PCT = 80.0
 #: Channels that remove less than this share of the mean square explain next to nothing.
 _LITTLE = 0.1
-#: Named effects leave less than the ceiling where they leave no more than this share of it.
-_LESS = 0.9
 #: A remainder that leaves more than this share of the error removes nothing that shows in two digits.
 _MEASURABLE = 0.995
 #: Channels of the remainder that are named.
@@ -63,23 +61,21 @@ def ceiling(found: Mapping[str, Any]) -> Words:
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
     if (best := found.get("ceiling")) is None:
+        found_too = ", and nothing that was found," if found["effects"] or found.get("remainder") else ""
         return [
-            "No linear combination of the logged channels has a smaller error on held-out data than the base model."
+            f"No linear combination of the logged channels{found_too} has a smaller error on held-out data than the "
+            "base model."
         ]
-    lines = [
-        f"With the best linear combination of all logged channels, the error on held-out data is "
-        f"{best['rms_um']:.2f} µm rms, with the base model {found['before']['rms_um']:.2f}."
-    ]
+    lines = [_of_all(found, best)]
     if not (share := explained(found)):
         return [*lines, "The channels can explain almost nothing of the error."]
     lines.append(share)
-    if found["effects"] and (named := named_rms(found)) < _LESS * best["rms_um"]:
-        lines.append(
-            f"Their error is smaller, {named:.2f} µm rms: not every effect is a linear combination of the channels."
-        )
     if falls_short(found):
         rest = "no remainder was added"
-        if beside := found.get("remainder"):
+        beside = found.get("remainder")
+        if beside and not beside["deployed"]:
+            rest = "nothing is deployed"
+        elif beside:
             lowers = _lowers(beside)
             rest = (
                 "the remainder corrects some of the rest" if lowers else "the remainder does not lower the error there"
@@ -90,6 +86,22 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
             else f"The channels show something that no named effect explains; {rest}."
         )
     return lines
+
+
+def _of_all(found: Mapping[str, Any], best: Mapping[str, Any]) -> str:
+    """Return the smallest error on held-out data, what has it, and what the channels leave in a linear combination."""
+    linear, base = best.get("linear_rms_um") or best["rms_um"], found["before"]["rms_um"]
+    if linear <= best["rms_um"]:
+        return (
+            f"With the best linear combination of all logged channels, the error on held-out data is "
+            f"{linear:.2f} µm rms, with the base model {base:.2f}."
+        )
+    by = "the named effects" if named_rms(found) <= found["after"]["rms_um"] else "the remainder"
+    return (
+        f"The smallest error on held-out data of all that was tried is {best['rms_um']:.2f} µm rms, with {by}. The "
+        f"best linear combination of all logged channels, without names, leaves {linear:.2f}, the base model "
+        f"{base:.2f}."
+    )
 
 
 def _lowers(rest: Mapping[str, Any]) -> bool:
@@ -103,12 +115,37 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
         return []
     channels = rest["channels"]
     more = f" and {len(channels) - _NAMED} more" if len(channels) > _NAMED else ""
-    deployed = "Deployed in the extended model." if rest["deployed"] else "Not deployed in the extended model."
-    removes = [] if _lowers(rest) else ["It removes nothing that can be measured on held-out data."]
+    before, after, instead = rest["rms_before_um"], rest["rms_after_um"], rest.get("instead", False)
+    place = "without it"
+    if found["effects"]:
+        place = "with the named effects" if instead else "with the named effects alone"
+    it = "with it in their place" if found["effects"] and instead else "with it"
+    figures = f"Error on held-out data: {before:.2f} µm rms {place}, {after:.2f} {it}."
+    if after * _MEASURABLE > before:
+        figures += " It increases the error there."
+    elif not _lowers(rest):
+        figures += " It removes nothing there that can be measured."
+    if fit := found.get("fit"):
+        named = fit["named_um"] if found["effects"] else fit["before_um"]
+        figures += f" In the fit to all data: {named:.2f} and {fit['after_um']:.2f}."
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
-        f"Error on held-out data: {rest['rms_before_um']:.2f} µm rms without it, {rest['rms_after_um']:.2f} with it.",
-        *removes,
-        deployed,
+        figures,
+        _why_deployed(rest) if rest["deployed"] else "Not deployed in the extended model.",
     ]
     return [Words(title="Remainder", lines=lines)]
+
+
+def _why_deployed(rest: Mapping[str, Any]) -> str:
+    """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
+    deployed = "Deployed in the extended model"
+    if rest.get("belongs"):
+        return (
+            f"{deployed} with the named effects: it is the base model's own error that they were fitted beside, and "
+            "they hold only with it. Held-out data do not decide it."
+        )
+    if rest.get("instead"):
+        return f"{deployed} in place of the named effects, because all data are more probable with it."
+    if not _lowers(rest):
+        return f"{deployed}, because all data are more probable with it."
+    return f"{deployed}."

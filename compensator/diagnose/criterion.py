@@ -75,6 +75,19 @@ class Criterion:
         """Return the rms of what a fit leaves, µm."""
         return float(np.sqrt(np.sum(self.left(fit) ** 2) / self._evidence.count))
 
+    def compared(self, fit: Fit) -> float:
+        """Return the rms of what a fit leaves beside what its choice granted, µm: what rivals are compared by.
+
+        Where effects are fitted beside an error of the base's own paths and of their form, or beside paths that are
+        free, that is taken off. It is known on the points only.
+        """
+        likelihood = fit.likelihood
+        points = likelihood.points
+        if points.is_exact and not self._evidence.free_paths:
+            return self.rms(fit)
+        left = points.residual - fit.added - points.random(fit.rest) @ likelihood.weights(fit.added)
+        return float(np.sqrt(np.mean(left**2)))
+
     @property
     def price(self) -> float:
         """What a usual effect must add to the logarithm of the evidence."""

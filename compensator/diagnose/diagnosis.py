@@ -100,7 +100,7 @@ def diagnose(
     extended, remarks = (model, ()) if contradicted or reverses else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
-    verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
+    (verdict, is_explained), ceiling = _verdict(found, effects, held_out, extended), _ceiling(held_out)
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
@@ -108,11 +108,12 @@ def diagnose(
     if verdict != "adequate" or hides:
         tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
         tests += _between_undecided(found, deciding)
-        explained_pct, is_explained = ceiling.explained_pct if ceiling else None, verdict == "explained" or hides
+        explained_pct = ceiling.explained_pct if ceiling else None
         advice = advice_of(
-            found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
+            found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
         effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, start_k=evidence.start_k
     )
@@ -122,14 +123,15 @@ def diagnose(
         held_out=how_held_out(evidence),
         model=extended,
         evidence=evidence,
-        residual_before=np.where(
-            evidence.used, found.search.criterion.left(found.selection.before) - found.paths, np.nan
-        ),
+        residual_before=np.where(evidence.used, evidence.without_nuisances(before), np.nan),
         residual_after=np.where(evidence.used, left, np.nan),
+        paths_um=found.own_paths - found.paths,
+        remainder_um=found.whole - found.named,
+        named_rms_um=rms_of(evidence.left(evidence.residual, found.named, at_rest=False)[evidence.used]),
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
-        tried=_ranked(found),
+        tried=_ranked(found, effects),
         warnings=(*left_out, *remarks, *warnings),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),
@@ -183,6 +185,8 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
         channels=tuple(dict.fromkeys(found.remainder.effect.channels_that_matter())),
         rms_before_um=rms_of(held_out.named),
         rms_after_um=rms_of(held_out.whole),
+        instead=not found.explains,
+        belongs=found.belongs,
     )
 
 
@@ -213,10 +217,12 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     selection = found.selection
 
     def rms_without(responses: Sequence[Vector]) -> float:
-        left = evidence.residual - sum(responses, np.zeros(evidence.used.size))
+        # Paths that were fitted anew stay as they are.
+        left = evidence.residual - sum(responses, found.own_paths)
         return rms_of(evidence.without_nuisances(np.where(evidence.used, left, 0.0))[evidence.used])
 
-    after, searched = rms_without(found.responses), search.criterion.rms(selection.fit)
+    after = rms_without(found.responses)
+    chosen = search.criterion.compared(selection.fit), search.criterion.score(selection.fit)
     effects = []
     errors = standard_errors(found.fit)
     few = evidence.is_sparse
@@ -239,7 +245,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
                 rms_after_um=after,
                 signal=signal,
-                rivals=rivals_of(term, rivals, searched, test),
+                rivals=rivals_of(term, rivals, chosen, test),
                 replaced=not found.explains,
             )
         )
@@ -323,39 +329,64 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
 
 
 def _ceiling(held_out: HeldOut) -> Ceiling | None:
-    """Return what all channels could explain, and how much of that the named effects do."""
-    before, after, least = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
+    """Return the smallest error on held-out data of all that was tried, and how much of that the named effects do."""
+    linear_um = rms_of(held_out.ceiling)
+    before, after = rms_of(held_out.nothing) ** 2, rms_of(held_out.named) ** 2
+    least = min(linear_um**2, after, rms_of(held_out.whole) ** 2)
     if least >= before:
         return None
     return Ceiling(
-        rms_um=float(np.sqrt(least)), explained_pct=float(np.clip((before - after) / (before - least), 0, 1)) * 100
+        rms_um=float(np.sqrt(least)),
+        explained_pct=float(np.clip((before - after) / (before - least), 0, 1)) * 100,
+        linear_rms_um=linear_um,
     )
 
 
-def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
-    best: dict[str, float] = {}
-    for candidate in found.selection.rivals[0] if found.selection.rivals else ():
+def _ranked(found: Findings, effects: Sequence[FoundEffect]) -> tuple[tuple[str, float], ...]:
+    """Return what was tried in place of the largest effect, and that, with what each leaves."""
+    if not effects:
+        return ()
+    largest, selected = effects[0].place, found.selection.fit
+    at = next(i for i, term in enumerate(selected.terms) if term.hypothesis.place == largest)
+    best = {selected.terms[at].hypothesis.label: found.search.criterion.compared(selected)}
+    for candidate in found.selection.rivals[at]:
         label = candidate.term.hypothesis.label
         best[label] = min(candidate.rms_um, best.get(label, np.inf))
     return tuple(sorted(best.items(), key=lambda item: item[1]))
 
 
-def _verdict(found: Findings, held_out: HeldOut, extended: ThermalModel) -> Verdict:
-    """Return the verdict in one word; what the engine cannot know of a late T_Q counts as noise."""
+def _verdict(
+    found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut, extended: ThermalModel
+) -> tuple[Verdict, bool]:
+    """Return the verdict in one word, and whether nothing is left to look for.
+
+    "Explained" is said of the named effects alone; what the remainder corrects beside them is not looked for, but has
+    no name. What the engine cannot know of a late T_Q counts as noise.
+    """
     evidence = found.search.evidence
     observed = [term.hypothesis.effect.observed for term in found.terms]
-    left = evidence.left(evidence.residual, found.whole, at_rest=False)[evidence.used]
     unknown_um2 = late_variance_um2(extended)
     noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
-    is_noise = noise.is_explained(float(left @ left))
+
+    def leaves_noise(added: Vector) -> bool:
+        left = evidence.left(evidence.residual, added, at_rest=False)[evidence.used]
+        return noise.is_explained(float(left @ left))
+
+    is_noise = leaves_noise(found.whole)
     if not observed:
         nothing_acts = is_noise and not evidence.free_paths and found.remainder is None
-        return "adequate" if nothing_acts else "unexplained"
+        return ("adequate" if nothing_acts else "unexplained"), False
     if not any(observed):
-        return "unexplained"
-    holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
-    if evidence.is_sparse:
-        # What few values were fitted by must hold on those that it was not fitted to.
-        level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
-        holds = holds and rms_of(held_out.whole) ** 2 <= level
-    return "explained" if is_noise and holds and all(observed) and found.explains else "partly_explained"
+        return "unexplained", False
+
+    def holds(values: Vector) -> bool:
+        um = rms_of(values)
+        if evidence.is_sparse:
+            # What few values were fitted by must hold on those that it was not fitted to.
+            level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
+            return um <= rms_of(held_out.nothing) and um**2 <= level
+        return um <= rms_of(held_out.nothing)
+
+    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains
+    by_names = leaves_noise(found.named) and holds(held_out.named) and all(e.is_determined for e in effects)
+    return ("explained" if nothing_left and by_names else "partly_explained"), nothing_left

@@ -17,12 +17,14 @@ from compensator.diagnose.fit import Term
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
+from compensator.model.effects.input import NEEDS_CHANNEL
 from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
-REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
-#: Another explanation is a rival while it leaves no more than this many times as much.
-RIVAL_TIMES = 1.2
+REPLACED = " All channels together make the data more probable, so the remainder is deployed in its place."
+#: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
+#: evidence is smaller by no more than this: four times what decides, since forms are known approximately only.
+RIVAL_TIMES, RIVAL_EVIDENCE = 1.2, 20.0
 #: Most rivals of an effect.
 MOST_RIVALS = 3
 
@@ -101,12 +103,26 @@ class FoundEffect:
     @property
     def explanation(self) -> str:
         """For an engineer."""
-        return self.effect.explanation + (REPLACED if self.replaced else "")
+        words = self.effect.explanation
+        return words.replace(NEEDS_CHANNEL, "") + REPLACED if self.replaced else words
 
     @property
     def deployable(self) -> bool:
         """Whether the service can run it."""
         return self.effect.deployable and not self.replaced
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether its size is known: one of its sizes, or where it has none of its parameters, exceeds its error.
+
+        Lags near each other share one response: their sum is a size, too. A response of any form is known by its
+        course; its gain at rest may be open all the same.
+        """
+        if self.effect.has_any_form:
+            return True
+        searched = {free.name for free in self.term.hypothesis.free}
+        sized = [name for name in self.named if name not in searched] or list(self.named)
+        return not sized or any(abs(self.named[name]) >= self.std[name] for name in sized)
 
     @property
     def reverses_path(self) -> bool:
@@ -122,14 +138,18 @@ class Rival:
     ----------
     term : Term
         The other explanation.
-    rms_after_um : float
-        What it leaves, µm rms.
+    rms_after_um, rms_chosen_um : float
+        What it and the effect leave, µm rms, both as `Criterion.compared` has it.
+    log_evidence : float
+        By how much the data are more probable with it than with the effect, after the cost of the names.
     test : PlannedTest or None
         The test that tells both apart best; None where no test is possible.
     """
 
     term: Term
     rms_after_um: float
+    rms_chosen_um: float
+    log_evidence: float
     test: PlannedTest | None
 
     @property
@@ -173,7 +193,10 @@ def seen_of(effect: Effect, signal: Vector, evidence: Evidence) -> Seen:
 
 
 def rivals_of(
-    term: Term, others: Iterable[Candidate], after_um: float, test: Callable[[Candidate], PlannedTest | None]
+    term: Term,
+    others: Iterable[Candidate],
+    chosen: tuple[float, float],
+    test: Callable[[Candidate], PlannedTest | None],
 ) -> tuple[Rival, ...]:
     """Return the best of other explanations, one for each place, that leave nearly as little as an effect.
 
@@ -183,17 +206,26 @@ def rivals_of(
         The effect.
     others : iterable of Candidate
         Other explanations, best first.
-    after_um : float
-        What the effect leaves, µm rms.
+    chosen : (float, float)
+        What the effect leaves, µm rms, as it is known of the others, and its score.
     test : callable
         Returns the test that tells another explanation apart from the effect.
     """
     rivals: dict[Place, Rival] = {}
+    after_um, score = chosen
     for other in others:
         place, rms = other.term.hypothesis.place, other.rms_um
-        if place == term.hypothesis.place or place in rivals or rms > RIVAL_TIMES * after_um:
+        if place == term.hypothesis.place or place in rivals:
             continue
-        rivals[place] = Rival(term=other.term, rms_after_um=rms, test=test(other))
+        if rms > RIVAL_TIMES * after_um or other.score < score - RIVAL_EVIDENCE:
+            continue
+        rivals[place] = Rival(
+            term=other.term,
+            rms_after_um=rms,
+            rms_chosen_um=after_um,
+            log_evidence=other.score - score,
+            test=test(other),
+        )
         if len(rivals) == MOST_RIVALS:
             break
     return tuple(rivals.values())

@@ -42,9 +42,3 @@ def free_run_sentence(found: Mapping[str, Any]) -> str:
     where = f"On {worst['name']}{several}, which took no part in the search: " if held_out else ""
     text = f"{where}{words}."
     return f"{text[0].upper()}{text[1:]}"
-
-
-def is_contradicted(found: Mapping[str, Any]) -> bool:
-    """Whether the extended model is worse than the base model on data that took no part in the search."""
-    held_out = [one["scores"] for one in found.get("free_run", []) if one["role"] == HELD_OUT]
-    return any(EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in held_out)

@@ -37,28 +37,42 @@ class Remainder:
         Channels that respond.
     rms_before_um, rms_after_um : float
         Residual without it and with it on data that took no part, µm.
+    instead : bool
+        Whether it stands in place of the named effects.
+    belongs : bool
+        Whether it is the own error that the named effects were fitted beside, without which they do not hold.
     """
 
     deployed: bool
     channels: tuple[str, ...]
     rms_before_um: float
     rms_after_um: float
+    instead: bool = False
+    belongs: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ceiling:
-    """What the best linear use of all logged channels leaves on data that took no part.
+    """The smallest error on data that took no part: by all logged channels, the named effects, or with the remainder.
 
     Parameters
     ----------
     rms_um : float
-        Its residual, µm.
+        That error, µm.
     explained_pct : float
         How much of what it removes the named effects remove, %.
+    linear_rms_um : float, optional
+        What the best linear use of all logged channels leaves, µm; None: that is the smallest.
     """
 
     rms_um: float
     explained_pct: float
+    linear_rms_um: float | None = None
+
+    @property
+    def linear_um(self) -> float:
+        """What the best linear use of all logged channels leaves, µm."""
+        return self.rms_um if self.linear_rms_um is None else self.linear_rms_um
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +109,12 @@ class Diagnosis:
         Residual and signals.
     residual_before, residual_after : numpy.ndarray, shape (n,)
         Of the fit to everything, nuisances projected out, µm; NaN where y is missing.
+    paths_um, remainder_um : numpy.ndarray, shape (n,)
+        What the extension adds to the base model beside the effects, in the fit to all data, µm: by paths that were
+        fitted anew, and by the remainder (where it stands in place of the effects: less what these and the paths would
+        add); 0 where there are none.
+    named_rms_um : float
+        Residual of the fit with the named effects and without a remainder, µm.
     held_out_before, held_out_named, held_out_after : numpy.ndarray, shape (n,)
         Before, with the named effects, and with the remainder, too, each block by a search that did not see it.
     steps : tuple of Step
@@ -106,7 +126,7 @@ class Diagnosis:
     remainder : Remainder, optional
         What the channels explain and no named effect does; None where there is none.
     ceiling : Ceiling, optional
-        What all channels could explain; None where no linear use of them leaves less than the base model.
+        What could be explained; None where nothing that was tried leaves less than the base model.
     advice : Advice, optional
         What to measure and to test next; None where the model is adequate.
     could_hide : DetectionLimits, optional
@@ -120,6 +140,9 @@ class Diagnosis:
     evidence: Evidence
     residual_before: Vector
     residual_after: Vector
+    paths_um: Vector
+    remainder_um: Vector
+    named_rms_um: float
     held_out_before: Vector
     held_out_named: Vector
     held_out_after: Vector
@@ -232,5 +255,6 @@ def warnings_of(
             warnings.append(Remark(ModelWarning.HARDLY_DETERMINED, text))
         if effect.rivals:
             names = ", ".join(rival.label for rival in effect.rivals)
-            warnings.append(Remark(ModelWarning.NEARLY_AS_GOOD, f"{kind}: {names} would explain it nearly as well."))
+            how = "as well, or nearly" if any(rival.log_evidence > 0.0 for rival in effect.rivals) else "nearly as well"
+            warnings.append(Remark(ModelWarning.NEARLY_AS_GOOD, f"{kind}: {names} would explain it {how}."))
     return tuple(warnings)

@@ -47,12 +47,15 @@ class Candidate:
     fit : Fit
         The fit, with the other effects.
     rms_um : float
-        What it leaves, µm.
+        What it leaves, µm, as `Criterion.compared` has it.
+    score : float
+        Its criterion of selection.
     """
 
     term: Term
     fit: Fit
     rms_um: float
+    score: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -280,7 +283,12 @@ class Search:
         for hypothesis, values in self._scan.ranked(fit.rest, base, self.criterion.cost_of):
             if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
-                found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.criterion.rms(other))
+                found[hypothesis.place] = Candidate(
+                    term=other.terms[-1],
+                    fit=other,
+                    rms_um=self.criterion.compared(other),
+                    score=self.criterion.score(other),
+                )
         return tuple(sorted(found.values(), key=lambda item: item.rms_um))
 
 

@@ -17,7 +17,9 @@ from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import free_run_sentence
-from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
+from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder, rms_of
+from compensator.diagnose.standing import verdict_of
+from compensator.diagnose.standing import words as of_the_effects
 from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.simulation import SCORE_HEAD, Scores
@@ -85,17 +87,25 @@ _FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_aft
 
 def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dict[str, Any]:
     """Return the content of `diagnosis.json`."""
+    runs = [one.to_dict() for one in free_run]
     return {
-        "verdict": diagnosis.verdict,
+        "verdict": verdict_of(diagnosis.verdict, runs, diagnosis.noise_floor_um),
         "effects": [
             {
                 **_place(effect.term),
                 **{key: effect[key] for key in _FIGURES},
+                "determined": effect.is_determined,
             }
             for effect in diagnosis.effects
         ],
         "rivals": [
-            {**_place(rival.term), "rms_after_um": rival.rms_after_um, "how_to_tell_apart": rival.how_to_tell_apart}
+            {
+                **_place(rival.term),
+                "rms_after_um": rival.rms_after_um,
+                "rms_chosen_um": rival.rms_chosen_um,
+                "log_evidence": rival.log_evidence,
+                "how_to_tell_apart": rival.how_to_tell_apart,
+            }
             for effect in diagnosis.effects
             for rival in effect.rivals
         ],
@@ -103,13 +113,18 @@ def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dic
         "after": _scores(diagnosis.after),
         "held_out": diagnosis.held_out,
         "noise_floor_um": diagnosis.noise_floor_um,
+        "fit": {
+            "before_um": rms_of(diagnosis.residual_before),
+            "named_um": diagnosis.named_rms_um,
+            "after_um": rms_of(diagnosis.residual_after),
+        },
         "remainder": _table(diagnosis.remainder),
         "ceiling": _table(diagnosis.ceiling),
         "advice": advice_table(diagnosis.advice),
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
         **_could_hide(diagnosis.could_hide),
-        "free_run": [one.to_dict() for one in free_run],
+        "free_run": runs,
     }
 
 
@@ -213,6 +228,8 @@ def _words(found: Mapping[str, Any]) -> str:
         words = _DOES_NOT_HOLD
     elif ModelWarning.NOT_CONFIRMED in found["warning_codes"] and "could_hide" in found:
         words = _NOT_FORETOLD
+    elif said := of_the_effects(found):
+        words = said
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
     elif _without_a_name(found):
@@ -330,7 +347,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.remainder:
         rows.append(["with the remainder", *diagnosis.after.cells()])
     if diagnosis.ceiling:
-        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
+        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.linear_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],
@@ -353,6 +370,8 @@ def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Expl
     """Return the explanation of an effect, and whether the extended model has it."""
     if diagnosis.deploys(effect):
         deploy = "Deployed in the extended model."
+    elif effect.replaced:
+        deploy = "Not in the extended model."
     elif effect.deployable:
         deploy = "Not deployed: the model was left unchanged."
     else:
@@ -362,7 +381,11 @@ def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Expl
 
 def rivals(effect: FoundEffect) -> Words:
     """Return the rival explanations of an effect, and how to distinguish them."""
-    lines = [f"{r.label}: {r.rms_after_um:.2f} µm rms remain. {r.how_to_tell_apart}" for r in effect.rivals]
+    lines = [
+        f"{r.label}: {r.rms_after_um:.2f} µm rms remain, {r.rms_chosen_um:.2f} with the effect above (log evidence "
+        f"{r.log_evidence:+.3g} for the rival). {r.how_to_tell_apart}"
+        for r in effect.rivals
+    ]
     return Words(title="Rival explanations", lines=lines)
 
 

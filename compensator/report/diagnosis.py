@@ -10,8 +10,8 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import is_contradicted
 from compensator.diagnose.outcome import Diagnosis
+from compensator.diagnose.standing import is_contradicted, is_in_the_model
 from compensator.diagnose.summary import (
     SHOWN,
     channels_to_configure,
@@ -49,7 +49,10 @@ TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_expla
 
 
 def tone_of(found: Mapping[str, Any]) -> Tone:
-    """Return the tone of a diagnosis: that of its verdict, and no good one where the named effects fall short.
+    """Return the tone of a diagnosis: that of its verdict.
+
+    No good one where the named effects fall short, where a run that took no part says otherwise, or where none of them
+    can be deployed.
 
     Parameters
     ----------
@@ -59,7 +62,8 @@ def tone_of(found: Mapping[str, Any]) -> Tone:
     tone = TONES[found["verdict"]]
     if is_contradicted(found):
         return "warn"
-    return "warn" if tone == "good" and found["effects"] and falls_short(found) else tone
+    holds = not found["effects"] or (is_in_the_model(found) and not falls_short(found))
+    return tone if holds else "warn"
 
 
 def page_of(
@@ -103,6 +107,9 @@ def page_of(
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     """Show the residual of the base model, the effects over it, and below it what the largest of them act by."""
     total = np.sum([effect.signal for effect in diagnosis.effects], axis=0)
+    rest, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
+    deployed = rest is not None and rest.deployed
+    stands = deployed and rest is not None and rest.instead
     causes = {cause[0]: cause for effect in diagnosis.effects if (cause := _cause(diagnosis, effect)) is not None}
     below = tuple(
         Figure(
@@ -117,17 +124,31 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     )
     one = len(diagnosis.effects) == 1
     words = name(diagnosis.effects[0]) if one else f"the {len(diagnosis.effects)} effects found"
+    refitted = bool(diagnosis.paths_um.any())
+    added = total + diagnosis.paths_um
+    effects = "effect" if one else "all effects"
+    if refitted:
+        effects += ", with the paths refitted"
+    inside = [diagnosis.deploys(effect) for effect in diagnosis.effects]
+    if not all(inside):
+        effects += " (not in the extended model)" if not any(inside) else " (not all in the extended model)"
+    lines = [
+        time.line("residual of the base model", diagnosis.residual_after + total + beside, weight=0.9),
+        time.line(effects, added, weight=2.2),
+    ]
+    if stands:
+        lines.append(time.line("remainder, in place of the effects", added + diagnosis.remainder_um))
+    elif deployed:
+        lines.append(time.line("remainder (explains nothing)", diagnosis.remainder_um))
     return Figure(
         title=f"Measured − predicted by the base model, and {words}",
         x_label="time, h",
         y_label="Y, µm",
-        lines=(
-            time.line("residual of the base model", diagnosis.residual_after + total, weight=0.9),
-            time.line("effect" if one else "all effects", total, weight=2.2),
-        ),
+        lines=tuple(lines),
         edges=time.runs,
         below=below,
-        note="Residual of the fit to all data, zero and initial state fitted."
+        note="Residual in all data, zero and initial state as fitted with everything found. What lies between it and "
+        "the effects is what these do not explain."
         + (" Below: the inputs of the effects." if below else " No channel shows the cause.")
         + time.note,
     )
@@ -175,15 +196,21 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
             title="", x_label="time, h", y_label=unit, lines=(time.line(label, values),), edges=time.unnamed, height=1.9
         )
         below = (panel,)
-    others = "every other effect and the remainder" if diagnosis.remainder else "every other effect"
-    note = f"Residual of the fit to all data, with {others} removed."
+    rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
+    note = f"Residual in all data without every other effect.{rest}"
     return Figure(
         title=f"{name(effect)} in the residual",
         x_label="time, h",
         y_label="Y, µm",
         lines=(
-            time.line("residual without it", diagnosis.residual_after + effect.signal, weight=0.9),
-            time.line("effect", effect.signal, weight=2.2),
+            time.line(
+                "residual without it", diagnosis.residual_after + diagnosis.remainder_um + effect.signal, weight=0.9
+            ),
+            time.line(
+                "effect" if diagnosis.deploys(effect) else "effect (not in the extended model)",
+                effect.signal,
+                weight=2.2,
+            ),
         ),
         edges=time.edges,
         below=below,
@@ -205,9 +232,8 @@ def _cause(diagnosis: Diagnosis, effect: FoundEffect) -> tuple[str, str, Vector]
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:
-    chosen = diagnosis.effects[0]
-    rows = [[name(chosen), f"{chosen.rms_after_um:.2f}", "chosen"]]
-    rows += [[label, f"{rms:.2f}", ""] for label, rms in diagnosis.tried]
+    chosen = diagnosis.effects[0].term.hypothesis.label
+    rows = [[label, f"{rms:.2f}", "chosen" if label == chosen else ""] for label, rms in diagnosis.tried]
     return Details(
         title="Candidates for the largest effect, ranked",
         blocks=[Table(head=["candidate", "remaining µm rms", ""], rows=rows)],

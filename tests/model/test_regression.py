@@ -441,6 +441,8 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         advice = could_hide = None
         model = SimpleNamespace(channels=())
         evidence = SimpleNamespace(model=model)
+        residual_before = residual_after = np.full(3, 2.0)
+        named_rms_um = 2.0
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None
@@ -455,8 +457,10 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
             "channels": ["t1_degc", "base_degc"],
             "rms_before_um": 1.4,
             "rms_after_um": 0.9,
+            "instead": False,
+            "belongs": False,
         },
-        "ceiling": {"rms_um": 0.8, "explained_pct": 83.0},
+        "ceiling": {"rms_um": 0.8, "explained_pct": 83.0, "linear_rms_um": None},
     }
     in_file = figures(found)
     assert {key: in_file[key] for key in wanted} == wanted

@@ -191,6 +191,37 @@ def test_the_only_effect_is_drawn_once_in_the_first_picture(found: Diagnosis) ->
     assert [panel.lines[0].name for panel in first.below] == [effect.channel]
 
 
+def test_the_residual_of_the_base_model_is_drawn_as_the_data_have_it(found: Diagnosis) -> None:
+    wave = np.sin(np.arange(found.residual_after.size) / 40.0)
+    # The remainder takes out what the effects leave.
+    with_it = dataclasses.replace(
+        found, remainder=REMAINDER, remainder_um=wave, residual_after=found.residual_after - wave
+    )
+
+    def lines(diagnosis: Diagnosis) -> list[Line]:
+        first = page(diagnosis).blocks[0]
+        assert isinstance(first, Figure)
+        return list(first.lines)
+
+    base, effects, rest = lines(with_it)
+    used = np.isfinite(found.residual_after)
+    filled = np.zeros(used.size)
+    filled[used] = base.y[np.isfinite(base.y)]
+    assert found.evidence.without_nuisances(filled)[used] == pytest.approx(found.residual_before[used], abs=1e-6)
+    assert rest.name == "remainder (explains nothing)" and rest.y[np.isfinite(rest.y)] == pytest.approx(wave)
+    between = filled[used] - effects.y[np.isfinite(effects.y)][used]
+    assert between == pytest.approx((with_it.residual_after + wave)[used])
+    # Neither a remainder nor effects that the extended model has not are drawn as if it had.
+    idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False), model=QUILL)
+    assert [line.name for line in lines(idle)] == [
+        "residual of the base model",
+        ("effect" if len(found.effects) == 1 else "all effects") + " (not in the extended model)",
+    ]
+    instead = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, instead=True), model=QUILL)
+    assert lines(instead)[2].name == "remainder, in place of the effects"
+    assert lines(instead)[2].y[used] == pytest.approx((lines(instead)[1].y + wave)[used])
+
+
 def test_the_headline_is_the_verdict_and_one_figure(found: Diagnosis) -> None:
     words = headline(figures(found))
     before, after = found.before.rms_um, found.after.rms_um
@@ -210,7 +241,9 @@ def test_the_headline_is_the_verdict_and_one_figure(found: Diagnosis) -> None:
 
 def drawn_term(kind: str) -> Any:
     places = {"step": ("step", "", ""), "gain": ("gain", "DTF", "")}
-    return SimpleNamespace(hypothesis=SimpleNamespace(place=places[kind], form=""), named={}, effect=None)
+    return SimpleNamespace(
+        hypothesis=SimpleNamespace(place=places[kind], form="", free=(), label=kind), named={}, effect=None
+    )
 
 
 def test_an_effect_that_was_not_deployed_does_not_claim_it(found: Diagnosis) -> None:
@@ -301,7 +334,10 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
     printed = text_of_all(contents(with_it, ()))
     for where in (text(with_it), printed):
         assert "t1_degc, base_degc: a correction that explains nothing." in where
-        assert "1.40 µm rms without it, 0.90 with it" in where and "the remainder corrects some of the rest" in where
+        assert (
+            "1.40 µm rms with the named effects alone, 0.90 with it" in where
+            and "the remainder corrects some of the rest" in where
+        )
     # The effects are not credited with what the remainder does.
     assert f"1.40 µm rms with them, {with_it.after.rms_um:.2f} with the remainder" in verdict(figures(with_it))
     assert [row[0] for row in error_table(with_it).rows][-3:] == [
@@ -311,8 +347,10 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
     ]
     worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
     assert "corrects some of the rest" not in text(worse) and "does not lower the error" in text(worse)
-    assert "removes nothing that can be measured" in text(worse)
-    assert "removes nothing that can be measured" not in text(with_it)
+    assert "It increases the error there" in text(worse) and "It increases the error there" not in text(with_it)
+    idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.4))
+    assert "removes nothing there that can be measured" in text(idle)
+    assert "removes nothing there that can be measured" not in text(with_it) + text(worse)
     idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False))
     assert "Not deployed in the extended model." in text(idle)
 

@@ -30,6 +30,8 @@ CURVES: Mapping[str, Callable[[Any], Any]] = {
     "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
 }
 _WORDS = {"linear": "", "square": " by its square", "abs": " by its magnitude", "power 5/3": " by its power 5/3"}
+#: What an extended model that has the effect needs, at the end of its explanation.
+NEEDS_CHANNEL = "; the extended model needs the channel"
 _POWERS = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}
 
 
@@ -57,7 +59,7 @@ class Input(BankEffect, Effect):
         delay = f" and a dead time of {digits(self.delay_min)} min" if self.delay_min else ""
         return (
             f"{self.size_words(seen)}. The base model lacks this input, which acts{_WORDS[self.curve]} with "
-            f"{self.lag_words()}{delay}; the extended model needs the channel."
+            f"{self.lag_words()}{delay}{NEEDS_CHANNEL}."
         )
 
     def named(self, given: dict[str, float]) -> dict[str, float]:

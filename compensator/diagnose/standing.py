@@ -1,0 +1,123 @@
+"""What may be said of the named effects: found, found in part, or undecided. One definition for text, page and JSON.
+
+"Found" is said of the named effects alone, against the noise of the data; a remainder that corrects what they leave
+explains nothing. A run that took no part has the last word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
+from compensator.diagnose.noise import VERDICT_TIMES
+
+#: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
+#: mean square about the mean there: more is gone than stays.
+CONFIRMS = 0.5
+
+
+def is_contradicted(found: Mapping[str, Any]) -> bool:
+    """Whether the extended model is worse than the base model on data that took no part in the search.
+
+    Parameters
+    ----------
+    found : mapping
+        Content of `diagnosis.json`.
+    """
+    return any(
+        EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in _fresh(found.get("free_run", []))
+    )
+
+
+def is_confirmed(free_run: Sequence[Mapping[str, Any]], noise_um: float) -> bool:
+    """Whether what was deployed helps on every run that took no part; true where none says anything.
+
+    A run on which the base model leaves noise says nothing, nor does one on which both models are the same.
+
+    Parameters
+    ----------
+    free_run : sequence of mapping
+        As in `diagnosis.json`.
+    noise_um : float
+        What the sensors' noise makes of the residual, µm.
+    """
+    for one in _fresh(free_run):
+        base, own = one[BASE]["rms_about_mean_um"], one.get(EXTENDED, one[BASE])["rms_about_mean_um"]
+        is_noise = max(base, own) <= VERDICT_TIMES * noise_um
+        if own != base and not is_noise and own**2 > CONFIRMS * base**2:
+            return False
+    return True
+
+
+def _fresh(free_run: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return [one["scores"] for one in free_run if one["role"] == HELD_OUT]
+
+
+def verdict_of(verdict: str, free_run: Sequence[Mapping[str, Any]], noise_um: float) -> str:
+    """Return a verdict in one word after the runs that took no part: what they do not confirm is not `explained`."""
+    return "partly_explained" if verdict == "explained" and not is_confirmed(free_run, noise_um) else verdict
+
+
+def undecided(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the effects that are smaller than their own standard error."""
+    return [effect for effect in found["effects"] if not effect.get("determined", True)]
+
+
+def is_in_the_model(found: Mapping[str, Any]) -> bool:
+    """Whether any of the effects can be deployed."""
+    return any(effect.get("deployable", True) for effect in found["effects"])
+
+
+def words(found: Mapping[str, Any]) -> str:
+    """Return what is said of the named effects beyond the verdict in one word; empty where that says all.
+
+    Parameters
+    ----------
+    found : mapping
+        Content of `diagnosis.json`.
+    """
+    if not found["effects"]:
+        return ""
+    if not is_confirmed(found.get("free_run", []), found["noise_floor_um"]):
+        return (
+            "The effects explain the data that were searched, but little or nothing of a run that took no part: what "
+            "the model lacks was not found."
+        )
+    if len(undecided(found)) == len(found["effects"]):
+        return _undecided(found)
+    if said := _by_the_remainder(found):
+        return said
+    if found["verdict"] == "explained" and not is_in_the_model(found):
+        return "The missing effects were found, but none of them can be deployed: the model's error stays as it is."
+    return ""
+
+
+def _undecided(found: Mapping[str, Any]) -> str:
+    size = "its" if len(found["effects"]) == 1 else "their"
+    test = " The test that decides is among what to measure next." if _has_test(found) else ""
+    return (
+        f"The model lacks an effect. What is named may act, but is smaller than {size} own standard error: these data "
+        f"do not decide.{test}"
+    )
+
+
+def _has_test(found: Mapping[str, Any]) -> bool:
+    return bool(found.get("rivals")) and any("expected change" in one["how_to_tell_apart"] for one in found["rivals"])
+
+
+def _by_the_remainder(found: Mapping[str, Any]) -> str:
+    """Return what the named effects explain and what the remainder corrects; empty where it has no part in it."""
+    rest, fit = found.get("remainder"), found.get("fit")
+    if not rest or not rest["deployed"] or not fit or found["verdict"] == "explained":
+        return ""
+    left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
+    if rest.get("instead"):
+        return (
+            f"What is named resembles the cause most: {left}. All channels together make the data more probable: the "
+            f"remainder, which explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
+        )
+    return (
+        f"What was found explains the error in part: {left}. The remainder, which explains nothing, corrects that to "
+        f"{fit['after_um']:.2f}."
+    )
