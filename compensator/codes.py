@@ -565,7 +565,7 @@ class DataRemark(Code):
     )
     AT_LIMIT = (
         "at_limit",
-        "A channel stands at exactly its largest or smallest value and comes and leaves with a slope: the end of a range.",
+        "A channel stands at exactly its largest or smallest value, and comes and leaves steeply: the end of a range.",
         "Widen the range of the sensor, its transmitter or the logger, and record again.",
     )
     UNIT_CHANGES = (
@@ -585,7 +585,7 @@ class DataRemark(Code):
     )
     FOLLOWS_Y = (
         "follows_y",
-        "A channel follows Y without delay, noise included, as no temperature can: a second measurement of Y, no cause.",
+        "A channel follows Y without delay, noise included, as no temperature can: it measures Y and is no cause.",
         "Nothing. If it is a displacement, let its name end in _um.",
     )
     PROBES_LEFT_OUT = (
