@@ -33,6 +33,8 @@ LONGEST_H, REST_H, LEVEL_H = 24.0, 1.0, 2.0
 LEAST_AMBIENT_K, AIR_H, SET_MIN = 2.0, 1.0, 15.0
 #: A temperature follows what is commanded if that explains this share of its variance.
 FOLLOWS = 0.7
+#: And if each half of the record leaves less than this share of the variance in the other.
+FORETOLD = 0.5
 #: Lags of that, min, and the weight that keeps its gains near zero.
 LAGS_MIN, RIDGE = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), 1e-3
 #: Difference T_Q − AT of a model without known heat, among what is set or follows.
@@ -274,13 +276,26 @@ class Trials:
         levels = (which[:, None] == np.arange(1, begin.size)).astype(float)
         scale = np.maximum(np.std(table, axis=0), 1e-12)
         solve = _regression(table / scale, levels)
+        half = np.arange(which.size) < which.size / 2
+        foretell = [(_regression(table[of] / scale, levels[of]), ~of) for of in (half, ~half)]
         found = {}
         for name in [*self._temperatures, *([] if has_ttf else [DIFFERENCE])]:
             values = self._recorded(name)[::stride]
             gains, explained = solve(values)
-            if explained > FOLLOWS:
+            # Enough lags explain any slow course; each half of the record foretells the other only where it follows.
+            left = sum(
+                _sum_of_squares(values[to] - table[to] / scale @ by(values[of])[0], levels[to])
+                for (by, to), of in zip(foretell, (half, ~half), strict=True)
+            )
+            whole = sum(_sum_of_squares(values[of], levels[of]) for of in (half, ~half))
+            if explained > FOLLOWS and left < FORETOLD * whole:
                 found[name] = dict(zip(causes, (gains / scale).reshape(-1, len(LAGS_MIN)), strict=True))
         return found
+
+
+def _sum_of_squares(values: Vector, levels: Matrix) -> float:
+    left = values - levels @ np.linalg.lstsq(levels, values, rcond=None)[0]
+    return float(left @ left)
 
 
 def _regression(table: Matrix, levels: Matrix) -> Callable[[Vector], tuple[Vector, float]]:
