@@ -563,6 +563,31 @@ class DataRemark(Code):
         "Single readings far from their neighbours were left out.",
         "Check the sensor for loose contacts and noise.",
     )
+    AT_LIMIT = (
+        "at_limit",
+        "A channel stands at exactly its largest or smallest value, and comes and leaves steeply: the end of a range.",
+        "Widen the range of the sensor, its transmitter or the logger, and record again.",
+    )
+    UNIT_CHANGES = (
+        "unit_changes",
+        "A temperature jumps by what lies between two units, such as °C and °F, and goes on from there.",
+        "Find out when the logger's unit was changed, and write the whole column in °C.",
+    )
+    COLUMN_EMPTY = (
+        "column_empty",
+        "A column has no value in any row.",
+        "Check the sensor and the logger, or leave the column out.",
+    )
+    COLUMN_COPY = (
+        "column_copy",
+        "A channel has the values of another one in every row; only the first of them is searched.",
+        "Give each sensor a column of its own; of two switches that always act together, no data can tell which acts.",
+    )
+    FOLLOWS_Y = (
+        "follows_y",
+        "A channel follows Y without delay, noise included, as no temperature can: it measures Y and is no cause.",
+        "Nothing. If it is a displacement, let its name end in _um.",
+    )
     PROBES_LEFT_OUT = (
         "probes_left_out",
         "Refused probes state that no offset was applied; other probes of the recording show that one was.",

@@ -29,6 +29,7 @@ from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
+from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.series import series_of
 from compensator.diagnose.standing import verdict_of
@@ -374,6 +375,7 @@ def _diagnosed(
     name = ", ".join(dict.fromkeys(run.name for run in runs))
     screen_temperatures(name, runs, quiet_air=True)
     require_y_noise(name, runs)
+    remarks += no_causes(name, runs).values()
     check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
     for one in validation:  # refused before the search, which may take minutes
         FreeRunErrors.of({BASE: base}, [one], HELD_OUT)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from compensator import display
 from compensator.codes import Remark
+from compensator.data.cleaning import cleaned, refuse_at_limit
 from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
@@ -111,7 +112,8 @@ class Measurement(display.Shown):
             If a value or time cannot have been measured.
         """
         data = to_grid(self.table, period_s)
-        return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
+        records, left_out = cleaned(self.name, data.records)
+        return SampledData(records=records, remarks=(*self.remarks, *data.remarks, *left_out))
 
     def before(self, hour: float) -> Measurement:
         """Return the rows before an hour from the start.
@@ -349,9 +351,9 @@ def runs_in(
         for record in part.records:
             check(record, measured.name)
             require(measured.name, record, _NEEDED)
-            for run, corrected in runs_of(measured.label, record):
+            refuse_at_limit(measured.name, record)
+            for run in runs_of(measured.label, record):
                 runs.append(dataclasses.replace(run, recording=number, y_std_um=y_std_um))
-                remarks += corrected
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
     return runs, remarks

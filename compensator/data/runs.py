@@ -1,4 +1,4 @@
-"""Measured runs for the fits: changes from the start, no gaps, no outliers."""
+"""Measured runs for the fits: changes from the start, no gaps."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Mask, Vector
-from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
 
-#: A single reading this many noise deviations away from both neighbours is an outlier.
-OUTLIER_DEVIATIONS = 12.0
 #: Longest stretch at the start of a run whose mean is its reference, samples.
 REST_SAMPLES = 30
 #: A signal whose standard deviation is below this multiple of its noise's is noise alone.
@@ -98,8 +95,8 @@ class Run:
         return np.asarray(self.ambient_k + self.reference[1])
 
 
-def runs_of(name: str, record: SampledRecord) -> Iterator[tuple[Run, tuple[Remark, ...]]]:
-    """Yield the runs of a record with remarks on its corrections.
+def runs_of(name: str, record: SampledRecord) -> Iterator[Run]:
+    """Yield the runs of a record.
 
     Parameters
     ----------
@@ -108,12 +105,7 @@ def runs_of(name: str, record: SampledRecord) -> Iterator[tuple[Run, tuple[Remar
     record : SampledRecord
         Needs `t_q_degc`, `at_degc`, `y_um`; `heat_w` where it is known.
     """
-    columns, remarks = {}, []
-    for column, values in record.columns.items():
-        cleaned, outliers = without_outliers(values) if column != "heat_w" else (values, 0)
-        if outliers and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {outliers} outlier(s) left out."))
-        columns[column] = cleaned
+    columns = record.columns
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)
     parts = list(_stretches(missing))
@@ -121,8 +113,7 @@ def runs_of(name: str, record: SampledRecord) -> Iterator[tuple[Run, tuple[Remar
         part = {c: v[first:last] for c, v in columns.items()}
         bridged = {c: v if c == "y_um" else _bridged(v) for c, v in part.items()}
         label = name if len(parts) == 1 else f"{name} part {i}"
-        run = dataclasses.replace(_run(label, record.t_s[first:last], bridged), row_s=record.row_s)
-        yield run, tuple(remarks if i == 1 else ())
+        yield dataclasses.replace(_run(label, record.t_s[first:last], bridged), row_s=record.row_s)
 
 
 def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
@@ -173,36 +164,6 @@ def _bridged(values: Vector) -> Vector:
     if known.size in (0, values.size):
         return values
     return np.interp(np.arange(values.size), known, values[known])
-
-
-def without_outliers(values: Vector) -> tuple[Vector, int]:
-    """Replace outliers, single readings far from both neighbours, by NaN.
-
-    A step stays: its samples are near one of their neighbours.
-
-    Examples
-    --------
-    >>> values = np.tile([1.0, 1.1], 30)
-    >>> values[7] = 9.0
-    >>> without_outliers(values)[1]
-    1
-    """
-    known = np.flatnonzero(~np.isnan(values))
-    v = values[known]
-    if v.size < 7:
-        return values, 0
-    # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
-    limit = OUTLIER_DEVIATIONS * noise_std(v) + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
-    before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
-    across = np.abs(v[2:] - v[:-2])
-    apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)
-    apart &= across < 0.3 * np.minimum(np.abs(before), np.abs(after))
-    outliers = known[1:-1][apart]
-    if outliers.size == 0 or outliers.size > 0.02 * v.size:
-        return values, 0
-    cleaned = values.copy()
-    cleaned[outliers] = np.nan
-    return cleaned, int(outliers.size)
 
 
 def noise_std(values: Vector) -> float:

@@ -21,7 +21,7 @@ from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
 from compensator.diagnose.nearest import AT, TEMPERATURE, Near, acts_by_temperature, course_evidence, nearest
 from compensator.diagnose.trials import Trials
-from compensator.model.effects.seen import digits
+from compensator.model.effects.seen import roughly
 from compensator.model.effects.unobserved import Unobserved
 
 #: Channels and times that are listed.
@@ -211,7 +211,7 @@ def _memory_min(course: Vector, period_min: float) -> float:
 
 def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
     """Return where the next sensor should sit."""
-    tau = digits(unexplained.tau_min)
+    tau = roughly(unexplained.tau_min)
     if unexplained.tau_min < NEAR_MIN:
         where = f"at the source of heat or force itself, a small mass ({tau} min is fast)"
     elif unexplained.tau_min < HOUSING_MIN:
@@ -235,7 +235,7 @@ def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
 
 def resembling(near: Sequence[Near]) -> list[Near]:
     """Return the channels that come near by more than chance."""
-    return [one for one in near if one.evidence >= DECIDES]
+    return [one for one in near if one.evidence >= DECIDES + one.by_chance]
 
 
 # ---------------------------------------------------------------------- tests

@@ -7,7 +7,7 @@ from typing import Any
 from compensator.diagnose.advice import Advice, SeenOnce, Unexplained, resembling
 from compensator.diagnose.deciding import SHOWN, PlannedTest
 from compensator.diagnose.events import DAY
-from compensator.model.effects.seen import digits
+from compensator.model.effects.seen import roughly
 
 #: Tests in sentences; all are in `diagnosis.json`.
 SAID = 2
@@ -26,7 +26,7 @@ def advice_lines(advice: Advice | None) -> list[str]:
     if advice.unexplained is not None:
         lines.append(_left(advice.unexplained))
         if alike := resembling(advice.nearest):
-            named = ", ".join(f"{near.channel} (log evidence +{digits(near.evidence)})" for near in alike[:3])
+            named = ", ".join(f"{near.channel} (log evidence +{roughly(near.evidence)})" for near in alike[:3])
             lines.append(f"Logged channels that resemble it most: {named}.")
         lines.append(advice.sensor)
     lines += [f"Next test, {_purpose(test)}: {test.sentence}" for test in advice.tests[:SAID]]
@@ -43,8 +43,8 @@ def _left(unexplained: Unexplained) -> str:
         goes = f"It coincides with the switching of {event.event} in {event.times} of {event.of} times."
     when = f", first at {times[0][1]:.1f} h" if unexplained.kind == "unobserved" and times else ""
     return (
-        f"{_WHAT[unexplained.kind]} by {digits(unexplained.rms_um)} µm rms with a time constant of "
-        f"{digits(unexplained.tau_min)} min{when}. {goes}"
+        f"{_WHAT[unexplained.kind]} by {roughly(unexplained.rms_um)} µm rms with a time constant of "
+        f"{roughly(unexplained.tau_min)} min{when}. {goes}"
     )
 
 
@@ -55,7 +55,9 @@ def _purpose(test: PlannedTest) -> str:
 
 
 def _repeat(seen: SeenOnce) -> str:
-    return f"Seen once: {seen.label} rests on a single change of {seen.driver}. Repeat it: {seen.test.sentence}"
+    return (
+        f"Seen once: {seen.label} rests on one rise and fall of {seen.driver} at most. Repeat it: {seen.test.sentence}"
+    )
 
 
 def advice_table(advice: Advice | None) -> dict[str, Any] | None:

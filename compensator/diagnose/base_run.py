@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.data.runs import Run, noise_std
+from compensator.diagnose.no_causes import DISPLACEMENT
 from compensator.diagnose.noise import drive_of
 from compensator.diagnose.smoothing import course
 from compensator.model.effects.hypothesis import COOLEST, DEGC, EQUAL, Context
@@ -19,8 +20,6 @@ from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: A displacement or tilt is an effect, never a cause: another probe follows Y whatever moves it.
-_DISPLACEMENT = ("_um", "_urad")
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
 #: A record begins warm if what the machine had at its start is more than this share of the span of the DTF's share.
@@ -117,12 +116,12 @@ def late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[Re
     return float(np.std(np.concatenate(errors)))
 
 
-def context_of(model: ThermalModel, signals: Sequence[RecordSignals]) -> Context:
-    """Return what proposals may build on: paths, gains, and channels that move."""
+def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Container[str] = ()) -> Context:
+    """Return what proposals may build on: paths, gains, and channels that move, but for those that are no causes."""
     common = [name for name in signals[0].channels if all(name in record.channels for record in signals)]
     spans, zeroed = {}, set()
     for name in common:
-        if name.endswith(_DISPLACEMENT):
+        if name in apart or name.endswith(DISPLACEMENT):
             continue
         values = np.concatenate([record.channels[name] for record in signals])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:

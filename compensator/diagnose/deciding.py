@@ -15,6 +15,7 @@ from compensator.diagnose.points import Points
 from compensator.diagnose.record_with_test import HOURS, RecordWithTest
 from compensator.diagnose.trials import REST_H, Trial, Trials
 from compensator.model.effects.blocks import Lag
+from compensator.model.effects.seen import roughly
 
 #: A change of the logarithm of the evidence that decides: odds of about 150 to 1.
 DECIDES = 5.0
@@ -64,7 +65,7 @@ class PlannedTest:
     @property
     def sentence(self) -> str:
         """What to do, how long, and by how much it decides."""
-        change = f"expected change of the log evidence {self.expected_evidence:.3g}; {DECIDES:g} decides"
+        change = f"expected change of the log evidence {roughly(self.expected_evidence)}; {DECIDES:g} decides"
         if self.probes:
             change = f"{self.probes} more probes, one each {self.every_min:g} min; {change}"
         if self.decides:
@@ -103,13 +104,15 @@ class Deciding:
         between : tuple of str
             Their names.
         drivers : tuple of str
-            Only tests that change one of these; empty: all.
+            Only tests that change one of these; empty: what moves either explanation. Where one acts by time alone,
+            to leave the machine at rest is a test of it.
 
         Returns
         -------
         PlannedTest or None
             None where no test changes any of the drivers.
         """
+        drivers = drivers or self._movers(first, second)
         channels = dict.fromkeys(t.hypothesis.place[2] for fit in (first, second) for t in fit.terms)
         trials = [
             trial
@@ -124,6 +127,13 @@ class Deciding:
                     planned += [self._planned(trial, first, second, between, every_min) for trial in some]
         # Of tests that decide equally soon, the surer one.
         return max(planned, key=_soonest, default=None)
+
+    def _movers(self, first: Fit, second: Fit) -> tuple[str, ...]:
+        """Return what moves either of two explanations and not the other fit as well; empty: anything may."""
+        places = first.places ^ second.places
+        movers = [self.trials.movers(place) for place in places]
+        alone = [""] if not all(movers) else []
+        return tuple(sorted(frozenset[str]().union(*movers, alone))) if any(movers) else ()
 
     def shown_again(self, others: Fit, *, size_um: float, tau_min: float, event: str, wait_h: float) -> PlannedTest:
         """Return the test in which a source that no channel shows acts again, with a sensor that shows it.
@@ -174,6 +184,8 @@ class Deciding:
 
     @staticmethod
     def _test(trial: Trial, change: Vector, between: tuple[str, str], every_min: float) -> PlannedTest:
+        # A test that ends before its driver is moved is none of it.
+        change = np.where(np.array(HOURS) > trial.moves_from_h, change, -np.inf)
         enough = np.flatnonzero(change >= DECIDES)
         at = int(enough[0]) if enough.size else int(np.argmax(change))
         return PlannedTest(

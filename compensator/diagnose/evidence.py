@@ -29,6 +29,7 @@ from compensator.diagnose.base_run import (
     with_warmths,
     without_noise,
 )
+from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.noise import NoiseTest, noise_floor, own_error
 from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
 from compensator.errors import DataError
@@ -270,7 +271,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         )
     noise_um = math.hypot(noise_floor(model, runs), late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
-    context = context_of(model, signals)
+    context = context_of(model, signals, no_causes(names, runs))
     nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
     basis = basis_of(nuisances, used)
     # The noise of a value that was measured now and then is none of the calibration's.

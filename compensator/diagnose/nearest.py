@@ -29,6 +29,8 @@ from compensator.model.effects.signals import RecordSignals
 BEHIND_MIN, AHEAD_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), (4.0, 12.0, 35.0)
 #: Sizes of a channel's gains that are tried, as shares of the deformation's spread.
 SIZES = np.geomspace(0.01, 3.0, 6)
+#: How many of the nearest channels are run backwards to see what is chance, and where each begins, as shares.
+CHECKED, BEGINNINGS = 5, (0.0, 0.17, 0.33, 0.5, 0.67, 0.83)
 #: Names of the base's own temperatures among the channels.
 T_Q, AT = "t_q_degc", "at_degc"
 #: A channel of this ending is a temperature.
@@ -48,11 +50,15 @@ class Near:
     lag_min : float
         Single lag that suits it best, min: what is to be explained comes later than the channel, or earlier where it is
         negative.
+    by_chance : float
+        The most that any of the nearest channels adds when it runs backwards, from several beginnings: signals as slow
+        as these resemble each other so far by chance.
     """
 
     channel: str
     evidence: float
     lag_min: float
+    by_chance: float = 0.0
 
 
 def acts_by_temperature(term: Term) -> bool:
@@ -81,8 +87,17 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
         observed = [term for term in observed if not acts_by_temperature(term)]
     base = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
     ranking = _Ranking(base, unexplained)
-    found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
-    return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
+    points = fit.likelihood.points
+    signals = _signals(points)
+    found = [ranking.of(name, _columns(points, values)) for name, values in signals.items()]
+    found = sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence)
+    backwards = [
+        ranking.of("", _columns(points, [np.roll(u[::-1], round(share * u.size)) for u in signals[near.channel]]))
+        for near in found[:CHECKED]
+        for share in BEGINNINGS
+    ]
+    by_chance = max((near.evidence for near in backwards), default=0.0)
+    return tuple(dataclasses.replace(near, by_chance=by_chance) for near in found)
 
 
 def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
@@ -135,22 +150,23 @@ def _single_lag(white: Matrix, target: Vector) -> float:
     return float(lags[int(np.argmax(gains))]) if white.shape[1] == len(lags) else 0.0
 
 
-def _banks(points: Points) -> list[tuple[str, Matrix]]:
-    """Return every channel with its columns of size 1, the base's own temperatures among them."""
+def _signals(points: Points) -> dict[str, list[Vector]]:
+    """Return every channel over the records, the base's own temperatures among them."""
     evidence = points.evidence
     names = list(evidence.context.channels)
     names += [T_Q, *([AT] if evidence.context.has_ambient else [])]
-    period_min = evidence.context.period_min
     references = [run.difference_k + run.ambient_k for run in evidence.runs]
 
     def signal(name: str, record: RecordSignals, t_q_k: Vector) -> Vector:
         return t_q_k if name == T_Q else record.ambient_k if name == AT else record.channels[name]
 
-    found = []
-    for name in names:
-        values = [signal(name, r, t_q) for r, t_q in zip(evidence.signals, references, strict=True)]
-        found.append((name, _unit(points, points.averaged(_bank(values, period_min)))))
-    return found
+    records = list(zip(evidence.signals, references, strict=True))
+    return {name: [signal(name, record, t_q_k) for record, t_q_k in records] for name in names}
+
+
+def _columns(points: Points, values: Sequence[Vector]) -> Matrix:
+    """Return the columns of size 1 of a channel."""
+    return _unit(points, points.averaged(_bank(values, points.evidence.context.period_min)))
 
 
 def _bank(values: Sequence[Vector], period_min: float) -> Matrix:

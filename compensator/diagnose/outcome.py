@@ -222,7 +222,8 @@ def warnings_of(
     """
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
-    if effects and rms_after > rms_before:
+    # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
+    if any(effect.effect.observed for effect in effects) and rms_after > rms_before:
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
             text = f"The effects are clear in all data together, but do not predict held-out blocks better {numbers}."

@@ -21,8 +21,9 @@ from compensator.diagnose.events import HEAT, swings
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.nearest import AT, TEMPERATURE
 from compensator.model.effects.blocks import FilterBank, Lag
+from compensator.model.effects.hypothesis import Place
 from compensator.model.effects.input import unit_of
-from compensator.model.effects.seen import digits, unit_of_channel
+from compensator.model.effects.seen import roughly, unit_of_channel
 from compensator.model.effects.signals import RecordSignals
 
 #: Longest test, the rest that it begins with and that shows its zero and initial state, and how long each level of one
@@ -32,6 +33,8 @@ LONGEST_H, REST_H, LEVEL_H = 24.0, 1.0, 2.0
 LEAST_AMBIENT_K, AIR_H, SET_MIN = 2.0, 1.0, 15.0
 #: A temperature follows what is commanded if that explains this share of its variance.
 FOLLOWS = 0.7
+#: And if each half of the record leaves less than this share of the variance in the other.
+FORETOLD = 0.5
 #: Lags of that, min, and the weight that keeps its gains near zero.
 LAGS_MIN, RIDGE = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), 1e-3
 #: Difference T_Q − AT of a model without known heat, among what is set or follows.
@@ -55,6 +58,8 @@ class Trial:
         Whether it changes by itself what only followed other things in the record, which takes a heater or a cooler.
     first_level : str
         The same instruction for a test that ends within the first of several levels; empty where there is one.
+    moves_from_h : float
+        When the driver is moved first, h.
     """
 
     words: str
@@ -62,6 +67,7 @@ class Trial:
     signals: RecordSignals
     by_itself: bool = False
     first_level: str = ""
+    moves_from_h: float = REST_H
 
     def words_of(self, hours: float) -> str:
         """Return the instruction for a test of this length, h: none of a level that it does not reach."""
@@ -121,6 +127,13 @@ class Trials:
         start = self._start(name)
         return float(high - start if high - start >= start - low else low - start)
 
+    def movers(self, place: Place) -> frozenset[str]:
+        """Return what moves the cause of an effect: its channel, what drives its path; nothing for time alone."""
+        _, path, channel = place
+        paths = {"DTF": self.heating, "TTF": self.heating, "TDTF": AT}
+        # What follows the heating can be moved by itself, too.
+        return frozenset(filter(None, (paths.get(path, ""), channel, channel and self.mover(channel))))
+
     def mover(self, name: str) -> str:
         """Return what is changed so that something changes: itself, or the heating that it follows."""
         return self.heating if name in self._followers else name
@@ -144,14 +157,19 @@ class Trials:
             ramp = np.minimum(self._t_h / AIR_H, 1.0)
             yield self._trial(f"Change the ambient temperature by {by} with the machine at rest", name, {name: ramp})
             return
+        # A temperature is no input of the machine: something warms or cools what its sensor is in.
+        act, means = ("Warm", "heater") if size > 0.0 else ("Cool", "cooler")
         if name in self._followers:
-            words = f"Step {name} by {by} by itself, with a heater or a cooler, and hold it"
+            words = f"{act} {name} by {by} by itself, with a {means} of its own, and hold it"
             yield dataclasses.replace(self._trial(words, name, {name: hold}), by_itself=True)
             return
         label = "the heat" if name == HEAT else name
-        step = f"Step {label} by {by} and hold it, all else steady"
+        is_set = name in self._temperatures
+        step = f"{act} {label} by {by}" if is_set else f"Step {label} by {by}"
+        switch = f"{step} and back" if is_set else f"Switch {label} by {by} on and off"
+        step = f"{step} and hold it, all else steady"
         yield self._trial(step, name, {name: hold})
-        words = f"Switch {label} by {by} on and off every {LEVEL_H:g} h, all else steady"
+        words = f"{switch} every {LEVEL_H:g} h, all else steady"
         yield self._trial(words, name, {name: cycle}, first_level=step)
         if name == self.heating or name not in self._temperatures:
             words = f"Step {label} by half of {by}, all of it, half and none, {LEVEL_H:g} h each"
@@ -159,11 +177,11 @@ class Trials:
             yield self._trial(words, name, {name: sizes}, first_level=half)
         if name != self.heating and size:
             heating, above = "the heat" if self.heating == HEAT else self.heating, self._in_words(self.heating)
-            words = (
-                f"Switch {name} by {by} on and off every {LEVEL_H:g} h while {heating} stays {above} above its start"
-            )
+            words = f"{switch} every {LEVEL_H:g} h while {heating} stays {above} above its start"
             step = f"Step {heating} by {above} and hold it, all else steady"
-            yield self._trial(words, name, {name: 1.0 - cycle, self.heating: hold}, first_level=step)
+            courses = {name: 1.0 - cycle, self.heating: hold}
+            both = self._trial(words, name, courses, first_level=step)
+            yield dataclasses.replace(both, moves_from_h=REST_H + LEVEL_H)
 
     def _trial(self, words: str, driver: str, courses: Mapping[str, Vector], *, first_level: str = "") -> Trial:
         begun = self._t_h >= 0.0
@@ -219,6 +237,9 @@ class Trials:
         return np.concatenate([record.channels[name] for record in self.evidence.signals])
 
     def _start(self, name: str) -> float:
+        """Return where something is in the rest that a test begins with: what can be off is off, all else as it was."""
+        if name in self._commanded and name in self.evidence.context.zeroed:
+            return 0.0
         return float(self.evidence.signals[0].channels[name][0])
 
     def _in_words(self, name: str) -> str:
@@ -227,9 +248,10 @@ class Trials:
             unit = "w" if self.evidence.context.has_ttf else "k"
         elif not unit_of_channel(name):
             unit = ""
-        size = self.size(name)
+        # What is warmed or cooled says its sign by that.
+        size = abs(self.size(name)) if name in self._temperatures else self.size(name)
         what = " of T_Q − AT" if name == HEAT and unit == "k" else ""
-        return f"{digits(size)} {_UNITS.get(unit, unit)}{what}".strip()
+        return f"{roughly(size)} {_UNITS.get(unit, unit)}{what}".strip()
 
     def _filtered(self, values: Vector) -> Matrix:
         return FilterBank(LAGS_MIN, [(1.0,) * len(LAGS_MIN)], self.period_min).columns(values)
@@ -254,13 +276,26 @@ class Trials:
         levels = (which[:, None] == np.arange(1, begin.size)).astype(float)
         scale = np.maximum(np.std(table, axis=0), 1e-12)
         solve = _regression(table / scale, levels)
+        half = np.arange(which.size) < which.size / 2
+        foretell = [(_regression(table[of] / scale, levels[of]), ~of) for of in (half, ~half)]
         found = {}
         for name in [*self._temperatures, *([] if has_ttf else [DIFFERENCE])]:
             values = self._recorded(name)[::stride]
             gains, explained = solve(values)
-            if explained > FOLLOWS:
+            # Enough lags explain any slow course; each half of the record foretells the other only where it follows.
+            left = sum(
+                _sum_of_squares(values[to] - table[to] / scale @ by(values[of])[0], levels[to])
+                for (by, to), of in zip(foretell, (half, ~half), strict=True)
+            )
+            whole = sum(_sum_of_squares(values[of], levels[of]) for of in (half, ~half))
+            if explained > FOLLOWS and left < FORETOLD * whole:
                 found[name] = dict(zip(causes, (gains / scale).reshape(-1, len(LAGS_MIN)), strict=True))
         return found
+
+
+def _sum_of_squares(values: Vector, levels: Matrix) -> float:
+    left = values - levels @ np.linalg.lstsq(levels, values, rcond=None)[0]
+    return float(left @ left)
 
 
 def _regression(table: Matrix, levels: Matrix) -> Callable[[Vector], tuple[Vector, float]]:

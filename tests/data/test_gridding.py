@@ -55,6 +55,6 @@ def test_the_time_between_rows_stays_known_and_the_page_says_what_was_averaged(t
     path.write_text("\n".join(["t_s,t_q_degc,at_degc,y_um", *rows]) + "\n", encoding="utf-8")
     (record,) = read(path).at_period(60.0).records
     assert record.row_s == row_s
-    ((run, _),) = runs_of("a", record)
+    (run,) = runs_of("a", record)
     words = _averaged(SimpleNamespace(runs=[run], model=SimpleNamespace(period_s=60.0)))  # type: ignore[arg-type]
     assert words == (" Rows every 15 s are averaged to samples of 60 s." if row_s == 15.0 else " Samples of 60 s.")

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from compensator.data.cleaning import cleaned, without_outliers
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
-from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std, without_outliers
+from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std
 
 N = 600
 
@@ -27,12 +28,12 @@ def test_the_longest_gap_that_is_bridged(column):
     c = columns()
     c[column] = c[column].copy()
     c[column][200 : 200 + SHORT_GAP_SAMPLES] = np.nan
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert run.name == "day.csv"
     assert run.t_s.size == N
     assert np.isfinite(run.difference_k).all() and np.isfinite(run.ambient_k).all()
     c[column][200 : 201 + SHORT_GAP_SAMPLES] = np.nan
-    parts = [run for run, _ in runs(c)]
+    parts = list(runs(c))
     assert [run.name for run in parts] == ["day.csv part 1", "day.csv part 2"]
     assert [run.t_s.size for run in parts] == [200, N - 201 - SHORT_GAP_SAMPLES]
     assert parts[1].t_s[0] == (201 + SHORT_GAP_SAMPLES) * 60.0
@@ -42,7 +43,7 @@ def test_a_bridge_is_straight():
     c = columns()
     c["heat_w"] = np.linspace(0.0, 599.0, N)
     c["heat_w"][100:150] = np.nan
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert run.heat_w == pytest.approx(np.arange(N), abs=1e-9)
 
 
@@ -50,14 +51,14 @@ def test_every_part_has_its_own_reference():
     c = columns()
     c["at_degc"][300:400] = np.nan
     c["at_degc"][400:] += 3.0
-    first, second = (run for run, _ in runs(c))
+    first, second = runs(c)
     assert second.reference[1] - first.reference[1] > 2.0
     assert abs(first.ambient_k[0]) < 0.1 and abs(second.ambient_k[0]) < 0.1
 
 
 def test_absolute_temperatures_come_back():
     c = columns()
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert run.t_q_degc == pytest.approx(c["t_q_degc"], abs=1e-9)
     assert run.at_degc == pytest.approx(c["at_degc"], abs=1e-9)
 
@@ -66,11 +67,11 @@ def test_missing_ends_and_crumbs_are_left_out():
     c = columns()
     c["t_q_degc"][:70] = np.nan
     c["t_q_degc"][-5:] = np.nan
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert (run.t_s[0], run.t_s.size) == (70 * 60.0, N - 75)
     c = columns()
     c["at_degc"][SHORTEST_RUN - 1 : 200] = np.nan
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert run.t_s[0] == 200 * 60.0
 
 
@@ -83,14 +84,14 @@ def test_nothing_measured_gives_no_run():
 def test_the_reference_ends_where_the_heat_begins():
     c = columns()
     c["heat_w"] = np.where(np.arange(N) >= 10, 90.0, 0.0)
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert run.reference[0] == pytest.approx(np.mean(c["t_q_degc"][:10]), abs=1e-12)
 
 
 def test_other_channels_come_along_and_the_roles_do_not():
     c = columns() | {"spindle_rpm": np.arange(float(N))}
     c["spindle_rpm"][5] = np.nan
-    ((run, _),) = runs(c)
+    (run,) = runs(c)
     assert set(run.channels) == {"spindle_rpm"}
     assert run.channels["spindle_rpm"][5] == pytest.approx(5.0)
 
@@ -98,8 +99,8 @@ def test_other_channels_come_along_and_the_roles_do_not():
 def test_heat_is_never_cleaned():
     c = columns()
     c["heat_w"][450] = 90.0
-    ((run, remarks),) = runs(c)
-    assert run.heat_w[450] == 90.0
+    (record,), remarks = cleaned("day.csv", [SampledRecord(t_s=np.arange(N) * 60.0, columns=c)])
+    assert record.columns["heat_w"][450] == 90.0
     assert remarks == ()
 
 
@@ -169,7 +170,7 @@ def test_noise_skips_what_is_missing_and_of_nothing_is_nothing():
 def test_noise_of_runs_is_that_of_the_noisiest_and_noise_alone_is_seen():
     quiet, loud = columns(), columns(1)
     loud["y_um"] = loud["y_um"] + np.random.default_rng(9).normal(0.0, 2.0, N)
-    both = [run for c in (quiet, loud) for run, _ in runs(c)]
+    both = [run for c in (quiet, loud) for run in runs(c)]
     noise = noise_of(both)
     assert noise["y_um"] == noise_std(both[1].y_um) == pytest.approx(2.0, rel=0.15)
     assert noise["t_q_degc"] == max(noise_std(run.t_q_degc) for run in both)

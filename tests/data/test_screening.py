@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from compensator.data.cleaning import cleaned, without_outliers
 from compensator.data.record import SampledRecord
-from compensator.data.runs import noise_std, runs_of, without_outliers
+from compensator.data.runs import noise_std
 from compensator.data.screening import screen, screen_temperatures
 from compensator.errors import DataError
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
@@ -137,7 +138,7 @@ def test_a_wild_reading_goes_and_a_step_stays():
 def test_remarks_name_the_column():
     c = columns()
     c["y_um"][400] += 60.0
-    said = [remark for _, remarks in runs_of("day.csv", SampledRecord(np.arange(720) * 60.0, c)) for remark in remarks]
+    _, said = cleaned("day.csv", [SampledRecord(np.arange(720) * 60.0, c)])
     assert [one.code for one in said] == ["wild_readings"] and "day.csv: y_um: 1 outlier(s) left out" in said[0]
 
 

@@ -1,11 +1,12 @@
 """Advice: what is hidden and near what it sits, which test decides, and what was seen only once."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from compensator.diagnose.advice import Unexplained, _sensor, advice_of
+from compensator.diagnose.advice import Unexplained, _sensor, advice_of, resembling
 from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.events import follows_day, goes_with, swings, switched
@@ -14,7 +15,9 @@ from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.nearest import Near, nearest
+from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.points import Points
+from compensator.diagnose.record_with_test import HOURS as HOURS_OF_TESTS
 from compensator.diagnose.record_with_test import expected_change
 from compensator.diagnose.summary import contents, figures
 from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
@@ -126,6 +129,12 @@ def test_the_neighbour_of_a_hidden_channel_comes_nearest(seed):
     assert advice.nearest[0].channel == "housing_degc"
     assert advice.nearest[0].evidence > advice.nearest[1].evidence + DECIDES if advice.nearest[1:] else True
     assert nearest(found.selection.fit, found.selection.before.rest)[0] == advice.nearest[0]
+    assert resembling(advice.nearest)[0].channel == "housing_degc"
+
+
+def test_a_channel_resembles_only_by_more_than_chance():
+    above, below = (Near(channel="at_degc", evidence=30.0, lag_min=0.0, by_chance=by) for by in (20.0, 28.0))
+    assert resembling([above, below]) == [above]
 
 
 def test_where_nothing_is_hidden_no_sensor_is_advised():
@@ -189,7 +198,8 @@ def test_channels_that_move_together_are_told_apart_by_moving_one(twins):
         r for r in effect.rivals if {r.term.hypothesis.place[2], effect.channel} == {"coolant_degc", "cabinet_degc"}
     )
     assert rival.test.decides and rival.test.driver in ("coolant_degc", "cabinet_degc")
-    assert rival.how_to_tell_apart.startswith(f"Step {rival.test.driver}")
+    # A temperature is no input that could be stepped.
+    assert rival.how_to_tell_apart.startswith((f"Warm {rival.test.driver}", f"Cool {rival.test.driver}"))
     assert rival.test in twins[1].advice.tests
 
 
@@ -248,6 +258,70 @@ def test_a_switch_without_a_unit_is_stepped_without_one():
         "Step fan_on by 1 and hold it, all else steady",
         "Step fan_on by −1 and hold it, all else steady",
     )
+
+
+@pytest.fixture(scope="module")
+def begun_at_speed():
+    """Tests of a machine whose record begins at its highest speed, with the fan on, the floor on its own."""
+    n, rng = int(HOURS * 60), np.random.default_rng(4)
+    speed = np.repeat(rng.choice([0.0, 3000.0, 6000.0], n // 60), 60)
+    speed[:60] = 6000.0
+    fan, floor = np.repeat([1.0, 0.0, 1.0], n // 3), 20.0 + np.repeat(rng.normal(0.0, 1.0, n // 120), 120)
+    changed = {"spindle_rpm": speed, "fan_on": fan, "floor_degc": floor + rng.normal(0.0, 0.02, n)}
+    return Trials(evidence_of(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 31, **changed))))
+
+
+@pytest.mark.parametrize(("channel", "size"), [("spindle_rpm", 6000.0), ("fan_on", 1.0)])
+def test_a_test_begins_at_rest_although_its_record_began_at_speed(begun_at_speed, channel, size):
+    trials = [trial for trial in begun_at_speed.of([channel]) if trial.driver == channel]
+    assert begun_at_speed.size(channel) == size and trials
+    for trial in trials:
+        assert trial.signals.channels[channel][0] == 0.0 and trial.signals.channels[channel].max() == size
+        assert "−" not in trial.words
+
+
+def test_a_temperature_is_warmed_or_cooled_and_not_stepped(begun_at_speed):
+    trials = [trial for trial in begun_at_speed.of(["floor_degc"]) if trial.driver == "floor_degc"]
+    assert trials and all(trial.words.startswith(("Warm floor_degc", "Cool floor_degc")) for trial in trials)
+
+
+def test_a_test_between_two_causes_moves_one_of_them(begun_at_speed):
+    def movers(*places):
+        return set(Deciding(begun_at_speed)._movers(*(SimpleNamespace(places=frozenset([one])) for one in places)))
+
+    drift, floor, fan = ("drift", "", ""), ("input", "", "floor_degc"), ("input", "", "fan_on")
+    assert movers(drift, floor) == {"", "floor_degc"}
+    assert movers(floor, fan) == {"floor_degc", "fan_on"}
+    assert movers(("gain", "TDTF", ""), fan) == {"at_degc", "fan_on"}
+    assert movers(drift, ("step", "", "")) == set()  # anything may
+
+
+def test_a_test_of_a_channel_is_long_enough_to_move_it(begun_at_speed):
+    change = np.full(len(HOURS_OF_TESTS), 10.0 * DECIDES)
+    hours = {
+        trial.words: Deciding._test(trial, change, ("input fan_on", "nothing"), 0.0).hours
+        for trial in begun_at_speed.of(["fan_on"])
+        if trial.driver == "fan_on"
+    }
+    assert any("while" in words for words in hours)
+    for words, length in hours.items():
+        assert (length > REST_H + LEVEL_H) == ("while" in words)
+
+
+def test_a_source_that_no_channel_shows_is_no_reason_to_record_for_longer():
+    def codes(*, observed):
+        effect = SimpleNamespace(
+            effect=SimpleNamespace(observed=observed),
+            term=SimpleNamespace(effect=SimpleNamespace(counts_from_rest=False)),
+            place=("unobserved", "", ""),
+            named={},
+            std={},
+            rivals=(),
+            reverses_path=False,
+        )
+        return [remark.code for remark in warnings_of([effect], np.ones(9), 2.0 * np.ones(9), deployed=False)]
+
+    assert codes(observed=False) == [] and codes(observed=True) == ["made_worse"]
 
 
 @pytest.mark.parametrize(

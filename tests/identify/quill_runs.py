@@ -42,4 +42,4 @@ def simulated(plant, duty, seed, heat=True):
 def runs_from(columns, t_s=None, name="run"):
     n = next(iter(columns.values())).size
     record = SampledRecord(t_s=np.arange(n) * 60.0 if t_s is None else t_s, columns=columns)
-    return [run for run, _ in runs_of(name, record)]
+    return list(runs_of(name, record))

@@ -159,6 +159,17 @@ def digits(value: float) -> str:
     return text.replace("-", "−")
 
 
+def roughly(value: float) -> str:
+    """Return a number to two digits, for advice: what is expected is known no better.
+
+    Examples
+    --------
+    >>> roughly(3.97), roughly(171.2), roughly(-0.833), roughly(6000.0)
+    ('4', '170', '−0.83', '6000')
+    """
+    return digits(float(f"{value:.2g}"))
+
+
 def quantity(value: float, channel: str) -> str:
     """Return a value of a channel with the unit that its name carries.
 

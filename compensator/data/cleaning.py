@@ -1,0 +1,265 @@
+"""Leaves out readings that a sensor cannot have meant: single wrong ones, and those at the end of its range."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensator.arrays import Indices, Mask, Vector
+from compensator.codes import DataRemark, Remark
+from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
+from compensator.data.runs import is_sparse, noise_std
+from compensator.data.screening import DEAD_SAMPLES, LIVELY_STILL, LIVELY_TURNS
+from compensator.errors import DataError
+
+#: A single reading this many noise deviations away from what is beside it is an outlier.
+OUTLIER_DEVIATIONS = 12.0
+#: What is beside an outlier is together within this share of its distance.
+TOGETHER = 0.3
+#: At an end of a record so many samples beside a reading have to be together.
+BESIDE_SAMPLES = 5
+#: Endings of what is measured and follows slowly: temperatures, displacements, tilts. All else may be commanded.
+TEMPERATURE, SLOW = "_degc", ("_degc", "_um", "_urad")
+#: Temperatures that no model runs without.
+NEEDED = ("t_q_degc", "at_degc")
+#: Something is commanded where it changes by this share of its span in a sample.
+COMMANDED = 0.2
+#: Shortest stand at the end of a range, all of them together, and how far beside it its slope is looked at, samples.
+STAND_SAMPLES, STANDS_SAMPLES, SLOPE_SAMPLES = 10, 30, 5
+#: Two readings are the same value within this, relative: means of equal readings.
+SAME = 1e-9
+#: A jump from one unit to another is this many times what is left of it after a conversion.
+OTHER_UNIT = 10.0
+_UNITS = {"K": (1.0, 273.15), "°F": (1.8, 32.0)}
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """Where a channel stands at the end of its range.
+
+    Parameters
+    ----------
+    limit : float
+        The value.
+    mask : numpy.ndarray of bool, shape (n,)
+        The samples.
+    """
+
+    limit: float
+    mask: Mask
+
+    def in_words(self, column: str, t_s: Vector) -> str:
+        """Return channel, value, times and share."""
+        first = int(np.argmax(self.mask))
+        last = first + int(np.argmin(np.append(self.mask[first:], False))) - 1
+        count, share = int(self.mask.sum()), 100.0 * float(np.mean(self.mask))
+        return (
+            f"{column} stands at exactly {self.limit:g}, the end of what it shows, in {count} of {self.mask.size} "
+            f"samples ({share:.0f} %), first from t_s = {t_s[first]:g} to {t_s[last]:g}"
+        )
+
+
+def cleaned(name: str, records: Sequence[SampledRecord]) -> tuple[tuple[SampledRecord, ...], tuple[Remark, ...]]:
+    """Leave out what a sensor cannot have meant, with remarks.
+
+    Parameters
+    ----------
+    name : str
+        Name of the data, for messages.
+    records : sequence of SampledRecord
+        As they were averaged.
+    """
+    found, remarks = [], list[Remark]()
+    for record in records:
+        columns, is_switched = dict(record.columns), _is_switched_at_start(record.columns)
+        for column, values in record.columns.items():
+            if column == "heat_w":
+                continue
+            slow = column.endswith(SLOW) and not is_sparse(values)
+            kept, count = without_outliers(values, first=slow and not is_switched, last=slow)
+            if count:
+                remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {count} outlier(s) left out."))
+            if column.endswith(SLOW) and (stand := stand_at_limit(kept)):
+                needed = column in NEEDED
+                then = "what it was there is not known" if needed else "not used there"
+                words = f"{name}: {stand.in_words(column, record.t_s)}; {then}."
+                remarks.append(Remark(DataRemark.AT_LIMIT, words))
+                kept = kept if needed else np.where(stand.mask, np.nan, kept)
+            remarks += _changed_unit(name, column, kept, record.t_s)
+            columns[column] = kept
+        found.append(dataclasses.replace(record, columns=columns))
+    return tuple(found), tuple(remarks)
+
+
+def refuse_at_limit(name: str, record: SampledRecord) -> None:
+    """Refuse a record whose T_Q or AT stands at the end of its range: nobody can interpolate what was cut off.
+
+    Raises
+    ------
+    DataError
+        Naming channel, value, times and what to do.
+    """
+    for column in NEEDED:
+        if stand := stand_at_limit(record.columns[column]):
+            raise DataError(
+                f"{name}: {stand.in_words(column, record.t_s)}: the range of its sensor or transmitter? What the "
+                "temperature was there is not known. Widen the range and record again, or give the rows before and "
+                "after as files of their own"
+            )
+
+
+# ---------------------------------------------------------------------- single readings
+
+
+def without_outliers(values: Vector, *, first: bool = False, last: bool = False) -> tuple[Vector, int]:
+    """Replace outliers, single readings far from all that is beside them, by NaN.
+
+    A step stays: its samples are near one of their neighbours. The first and last reading of a stretch have neighbours
+    on one side only; they are outliers where these are together, and the signal has no such step elsewhere.
+
+    Parameters
+    ----------
+    values : numpy.ndarray, shape (n,)
+        A record; NaN where missing.
+    first, last : bool
+        Whether the first and last reading of each stretch without a long gap may be outliers, too.
+
+    Examples
+    --------
+    >>> values = np.tile([1.0, 1.1], 30)
+    >>> values[[0, 7]] = 9.0
+    >>> without_outliers(values)[1], without_outliers(values, first=True)[1]
+    (1, 2)
+    """
+    known = np.flatnonzero(~np.isnan(values))
+    v = values[known]
+    if v.size < BESIDE_SAMPLES + 2:
+        return values, 0
+    noise = noise_std(v)
+    # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
+    limit = OUTLIER_DEVIATIONS * noise + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
+    before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
+    across = np.abs(v[2:] - v[:-2])
+    apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)
+    apart &= across < TOGETHER * np.minimum(np.abs(before), np.abs(after))
+    outliers = known[1:-1][apart]
+    if noise > 0.0:  # what was computed has no wrong readings, but may begin with a step
+        known = np.setdiff1d(known, outliers)
+        ends = [end for end, asked in ((_first_alone, first), (_last_alone, last)) if asked]
+        outliers = np.union1d(outliers, [at for end in ends for at in end(values, known, limit)]).astype(int)
+    if outliers.size == 0 or outliers.size > 0.02 * v.size:
+        return values, 0
+    kept = values.copy()
+    kept[outliers] = np.nan
+    return kept, int(outliers.size)
+
+
+def _first_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:
+    """Yield the first reading of each stretch that stands alone against what follows."""
+    for part in np.split(known, np.flatnonzero(np.diff(known) > SHORT_GAP_SAMPLES) + 1):
+        v = values[part]
+        if v.size < BESIDE_SAMPLES + 2:
+            continue
+        jump = abs(float(v[1] - v[0]))
+        if jump <= limit or not _together(v, 0, jump):
+            continue
+        steps = np.abs(np.diff(v))
+        others = np.flatnonzero(steps > max(limit, 0.5 * jump)).tolist()
+        if not any(_together(v, i, float(steps[i])) for i in others if 0 < i < v.size - 1 - BESIDE_SAMPLES):
+            yield int(part[0])
+
+
+def _last_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:
+    n = values.size
+    for at in _first_alone(values[::-1], n - 1 - known[::-1], limit):
+        yield n - 1 - at
+
+
+def _together(v: Vector, i: int, jump: float) -> bool:
+    """Whether the samples behind a jump are together: a signal that was moved goes on to move."""
+    return bool(np.ptp(v[i + 1 : i + 1 + BESIDE_SAMPLES]) < TOGETHER * jump)
+
+
+def _is_switched_at_start(columns: Mapping[str, Vector]) -> bool:
+    """Whether the machine is switched in the second sample: then a jump of a measured signal may be real."""
+    for column, values in columns.items():
+        if not column.endswith(SLOW) and values.size > 1:
+            span = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
+            if span > 0.0 and abs(values[1] - values[0]) > COMMANDED * span:
+                return True
+    return False
+
+
+# ---------------------------------------------------------------------- ends of ranges and units
+
+
+def stand_at_limit(values: Vector) -> Stand | None:
+    """Return where a channel stands at the end of its range, if it does.
+
+    There it is exactly one value, its largest or smallest, for many samples, and comes and leaves with a slope, while
+    it is noisy elsewhere. A converter of coarse steps has such stands at every level, a machine at rest comes to its
+    smallest value slowly: neither is taken for one.
+
+    Parameters
+    ----------
+    values : numpy.ndarray, shape (n,)
+        A record; NaN where missing.
+    """
+    known = np.flatnonzero(~np.isnan(values))
+    v = values[known]
+    if v.size < STANDS_SAMPLES + DEAD_SAMPLES or np.ptp(v) == 0.0:
+        return None
+    for limit in (float(v.max()), float(v.min())):
+        at = np.abs(v - limit) <= SAME * max(1.0, abs(limit))
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0]))))
+        long = [
+            (a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= STAND_SAMPLES
+        ]
+        if sum(b - a for a, b in long) >= STANDS_SAMPLES and _is_lively(v, at) and _is_cut_off(v, at, long):
+            mask = np.zeros(values.size, dtype=bool)
+            mask[known[at]] = True
+            return Stand(limit, mask)
+    return None
+
+
+def _is_lively(v: Vector, at: Mask) -> bool:
+    """Whether a signal is noisy, in steps finer than its noise, where it is not at its limit."""
+    steps = np.diff(v)[~at[1:] & ~at[:-1]]
+    if steps.size < DEAD_SAMPLES:
+        return False
+    turns, still = float(np.mean(steps[1:] * steps[:-1] < 0.0)), float(np.mean(steps == 0.0))
+    return turns > LIVELY_TURNS and still < LIVELY_STILL
+
+
+def _is_cut_off(v: Vector, at: Mask, stands: Sequence[tuple[int, int]]) -> bool:
+    """Whether a signal comes to its limit, and leaves it, as steeply as it usually moves."""
+    k = SLOPE_SAMPLES
+    usual = np.abs(v[k:] - v[:-k])[~at[k:] & ~at[:-k]]
+    least = max(float(np.median(usual)) if usual.size else np.inf, 2.0 * noise_std(v))
+    comes = [abs(v[a] - v[a - k]) for a, _ in stands if a >= k]
+    leaves = [abs(v[b - 1 + k] - v[b - 1]) for _, b in stands if b - 1 + k < v.size]
+    return bool(comes and leaves and min(np.median(comes), np.median(leaves)) > least)
+
+
+def _changed_unit(name: str, column: str, values: Vector, t_s: Vector) -> Iterator[Remark]:
+    """Yield a remark on a temperature that goes on in another unit from some sample on."""
+    known = np.flatnonzero(~np.isnan(values))
+    v = values[known]
+    if not column.endswith(TEMPERATURE) or v.size < 2 * STANDS_SAMPLES:
+        return
+    steps = np.abs(np.diff(v))
+    at = int(np.argmax(steps)) + 1
+    limit = OUTLIER_DEVIATIONS * noise_std(v) + 3.0 * float(np.quantile(steps, 0.95))
+    before, after = float(v[at - 1]), float(v[at])
+    for unit, (factor, shift) in _UNITS.items():
+        off = min(abs(factor * before + shift - after), abs(factor * after + shift - before)) / factor
+        if off < limit and steps[at - 1] > OTHER_UNIT * limit and min(at, v.size - at) >= STANDS_SAMPLES:
+            words = (
+                f"{name}: {column} jumps from {before:.4g} to {after:.4g} at t_s = {t_s[known[at]]:g}, as from °C to "
+                f"{unit} or back: one unit before and another one after?"
+            )
+            yield Remark(DataRemark.UNIT_CHANGES, words)
+            return

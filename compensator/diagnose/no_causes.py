@@ -1,0 +1,100 @@
+"""Channels that are no cause of Y: those without values, copies of others, and measurements of Y itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
+from compensator.codes import DataRemark, Remark
+from compensator.data.runs import Run, noise_std
+from compensator.data.screening import LIVELY_STILL
+from compensator.model.effects.hypothesis import DEGC
+
+#: A displacement or tilt is an effect, never a cause: another probe follows Y whatever moves it.
+DISPLACEMENT = ("_um", "_urad")
+#: Correlation of the noise of a channel with that of Y above which it measures Y, and the least number of samples. Of
+#: temperatures, speeds and loads of the measured spindle and of every eighth drawn development machine it is at most
+#: 0.22, of the spindle's probes beside each other 0.47 to 0.95, but for two pairs that tilt apart (0.25 to 0.34).
+SAME_NOISE, LEAST = 0.4, 300
+#: Steps count no more than all but this share of samples does; a sample later, less than this share of the correlation
+#: of noise is left.
+QUIET, SHARP = 0.8, 0.3
+#: A channel is Y times a constant where it differs from it by so many times the noise of both, and moves by so many.
+ALIKE, MOVES = 2.0, 30.0
+#: Values are the same to so many digits after the point: T_Q is stored as its difference from AT.
+_DIGITS = 9
+
+
+def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
+    """Return the channels that cannot be a cause of Y by name, each with a remark.
+
+    Parameters
+    ----------
+    name : str
+        Name of the data, for the remarks.
+    runs : sequence of Run
+        Measured data.
+    """
+    found: dict[str, Remark] = {}
+    common = [one for one in runs[0].channels if all(one in run.channels for run in runs)]
+    y = [run.y_um for run in runs]
+    roles = {"t_q_degc": [run.t_q_degc for run in runs], "at_degc": [run.at_degc for run in runs]}
+    first = {np.round(np.concatenate(parts), _DIGITS).tobytes(): role for role, parts in roles.items()}
+    for channel in (one for one in common if not one.endswith(DISPLACEMENT)):
+        parts = [run.channels[channel] for run in runs]
+        values = np.concatenate(parts)
+        if np.isnan(values).all():
+            found[channel] = Remark(DataRemark.COLUMN_EMPTY, f"{name}: {channel} has no value.")
+        elif np.isfinite(values).all() and np.ptp(values) > 0.0:
+            other = first.setdefault(np.round(values, _DIGITS).tobytes(), channel)
+            if other != channel:
+                words = f"{name}: {channel} has the values of {other} in every row; {other} alone is searched."
+                found[channel] = Remark(DataRemark.COLUMN_COPY, words)
+            elif measures_y(parts, y, is_temperature=channel.endswith(DEGC)):
+                words = f"{name}: {channel} follows y_um without delay: a second measurement of Y, not a cause."
+                found[channel] = Remark(DataRemark.FOLLOWS_Y, words)
+    return found
+
+
+def measures_y(channel: Sequence[Vector], y: Sequence[Vector], *, is_temperature: bool) -> bool:
+    """Whether a channel measures Y: it has the noise of Y, or is Y times a constant to within the noise of both.
+
+    Heat moves no temperature from one sample to the next as noise moves a probe, so what a channel shares with Y there
+    is Y. A temperature may be proportional to Y; what is commanded has no noise.
+
+    Parameters
+    ----------
+    channel, y : sequence of numpy.ndarray
+        A channel and Y of each run; NaN where missing.
+    is_temperature : bool
+        Whether the name of the channel says that it is one.
+    """
+    both = [np.column_stack([u, v])[np.isfinite(u) & np.isfinite(v)] for u, v in zip(channel, y, strict=True)]
+    table = np.concatenate(both)
+    steps = np.diff(table[:, 0])
+    if len(table) < LEAST or not np.ptp(table, axis=0).all() or float(np.mean(steps == 0.0)) > LIVELY_STILL:
+        return False
+    if _noise_correlation(np.concatenate([np.diff(part, 2, axis=0) for part in both])) > SAME_NOISE:
+        return True
+    u, v = table.T
+    gain, level = np.polyfit(v, u, 1)
+    noise = float(np.hypot(noise_std(u), gain * noise_std(v)))
+    left = float(np.std(u - gain * v - level))
+    return not is_temperature and 0.0 < left < ALIKE * noise and float(np.ptp(u)) > MOVES * noise
+
+
+def _noise_correlation(second: Matrix) -> float:
+    """Return the correlation of two columns of second differences at no delay; 0 where it is one of smooth signals.
+
+    Two smooth signals resemble each other a sample later as well, noise does not.
+    """
+    most = np.quantile(np.abs(second), QUIET, axis=0)
+    limited = np.clip(second, -most, most)
+    spread = np.std(limited, axis=0)
+    if len(limited) < LEAST or np.any(spread == 0.0):
+        return 0.0
+    u, v = ((limited - limited.mean(axis=0)) / spread).T
+    now, beside = float(np.mean(u * v)), float(np.mean(u[1:] * v[:-1]) + np.mean(u[:-1] * v[1:])) / 2.0
+    return abs(now) if beside * np.sign(now) < SHARP * abs(now) else 0.0

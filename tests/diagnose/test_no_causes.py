@@ -1,0 +1,73 @@
+"""Channels that are no cause of Y: without values, copies of others, measurements of Y itself."""
+
+import numpy as np
+import pytest
+
+from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.no_causes import no_causes
+from compensator.model.model_file import load_model
+from tests.data.test_cleaning import N, machine
+
+
+def day(**channels):
+    """Return a day of a machine with its coolant, which moves Y, and further channels."""
+    table, rng = machine(), np.random.default_rng(11)
+    coolant = 22.0 + 3.0 * np.sin(np.arange(N) / 90.0)
+    table["y_um"] = table["y_um"] + 2.0 * (coolant - 22.0)
+    table["coolant_degc"] = coolant + rng.normal(0.0, 0.03, N)
+    added = {name: make(table, rng) for name, make in channels.items()}
+    return runs_in(measurements(table | added, "day"))[0]
+
+
+MEASURES = {
+    "probe2": lambda table, rng: 0.3 * table["y_um"] + rng.normal(0.0, 0.05, N),
+    "ch4": lambda table, rng: -0.8 * table["y_um"] + 0.4 * table["t_q_degc"] + rng.normal(0.0, 0.05, N),
+    "tip": lambda table, rng: 2.0 * (table["y_um"] + 7.0),
+}
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_second_measurement_of_y_is_no_cause(name):
+    runs = day(**{name: MEASURES[name]})
+    found = no_causes("day", runs)
+    assert [(channel, remark.code) for channel, remark in found.items()] == [(name, "follows_y")]
+    assert "a second measurement of Y, not a cause" in found[name]
+    channels = evidence_of(load_model("quill"), runs).context.channels
+    assert "coolant_degc" in channels and name not in channels
+
+
+def test_causes_with_and_without_delay_and_noise_stay():
+    rpm = machine()["spindle_rpm"]
+    runs = day(
+        column_degc=lambda table, rng: 20.0 + 0.1 * table["y_um"].mean() + 0.3 * np.sin(np.arange(N) / 100.0),
+        speed_rpm=lambda table, rng: rpm + rng.normal(0.0, 3.0, N),
+        housing_degc=lambda table, rng: table["t_q_degc"] * 0.7 + rng.normal(0.0, 0.03, N),
+        pump_on=lambda table, rng: 1.0 * (rpm > 2000.0),
+    )
+    assert no_causes("day", runs) == {}
+
+
+def test_smooth_signals_without_noise_are_not_taken_for_measurements_of_y():
+    table = machine(noise_k=0.0)
+    table["y_um"] = 3.0 * (table["t_q_degc"] - table["at_degc"])
+    table["housing_degc"] = 20.0 + 0.5 * (table["t_q_degc"] - table["at_degc"])
+    assert no_causes("day", runs_in(measurements(table, "day"))[0]) == {}
+
+
+def test_of_copies_the_first_is_searched_and_an_empty_channel_is_said():
+    runs = day(
+        coolant2_degc=lambda table, rng: table["coolant_degc"].copy(),
+        t_q2_degc=lambda table, rng: table["t_q_degc"].copy(),
+        open_degc=lambda table, rng: np.full(N, np.nan),
+        off=lambda table, rng: np.zeros(N),
+        off_too=lambda table, rng: np.zeros(N),
+    )
+    found = no_causes("day", runs)
+    assert {name: str(remark.code) for name, remark in found.items()} == {
+        "coolant2_degc": "column_copy",
+        "t_q2_degc": "column_copy",
+        "open_degc": "column_empty",
+    }
+    assert "coolant2_degc has the values of coolant_degc" in found["coolant2_degc"]
+    assert set(evidence_of(load_model("quill"), runs).context.channels) == {"coolant_degc", "spindle_rpm"}
