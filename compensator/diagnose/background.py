@@ -95,9 +95,11 @@ class Background:
         blocks = self.template.blocks(context.period_min)
         of_gains = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
         #: The gains of the free weights, and the columns of these.
-        self.made_of = np.eye(of_gains.shape[1])
+        self.made_of: Matrix = np.eye(of_gains.shape[1])
         if recent:
-            self.made_of = np.kron(np.eye(len(inputs)), np.vstack([np.eye(len(taus) - 1), -np.ones(len(taus) - 1)]))
+            self.made_of = np.asarray(
+                np.kron(np.eye(len(inputs)), np.vstack([np.eye(len(taus) - 1), -np.ones(len(taus) - 1)]))
+            )
         self.columns = of_gains @ self.made_of
         self._of_gains = of_gains
         self.groups = np.repeat(np.arange(len(inputs)), len(taus) - recent)
