@@ -129,7 +129,7 @@ def without_outliers(values: Vector, *, first: bool = False, last: bool = False)
 
     Examples
     --------
-    >>> values = np.tile([1.0, 1.1], 30)
+    >>> values = np.tile([1.0, 1.1], 60)
     >>> values[[0, 7]] = 9.0
     >>> without_outliers(values)[1], without_outliers(values, first=True)[1]
     (1, 2)
