@@ -61,10 +61,8 @@ def ceiling(found: Mapping[str, Any]) -> Words:
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
     if (best := found.get("ceiling")) is None:
-        found_too = ", and nothing that was found," if found["effects"] or found.get("remainder") else ""
         return [
-            f"No linear combination of the logged channels{found_too} has a smaller error on held-out data than the "
-            "base model."
+            "No linear combination of the logged channels has a smaller error on held-out data than the base model."
         ]
     lines = [_of_all(found, best)]
     if not (share := explained(found)):
@@ -90,15 +88,16 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
 
 def _of_all(found: Mapping[str, Any], best: Mapping[str, Any]) -> str:
     """Return the smallest error on held-out data, what has it, and what the channels leave in a linear combination."""
-    linear, base = best.get("linear_rms_um") or best["rms_um"], found["before"]["rms_um"]
-    if linear <= best["rms_um"]:
+    linear, base = best["rms_um"], found["before"]["rms_um"]
+    least = best.get("least_rms_um") or linear
+    if linear <= least:
         return (
             f"With the best linear combination of all logged channels, the error on held-out data is "
             f"{linear:.2f} µm rms, with the base model {base:.2f}."
         )
     by = "the named effects" if named_rms(found) <= found["after"]["rms_um"] else "the remainder"
     return (
-        f"The smallest error on held-out data of all that was tried is {best['rms_um']:.2f} µm rms, with {by}. The "
+        f"The smallest error on held-out data of all that was tried is {least:.2f} µm rms, with {by}. The "
         f"best linear combination of all logged channels, without names, leaves {linear:.2f}, the base model "
         f"{base:.2f}."
     )

@@ -329,16 +329,14 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
 
 
 def _ceiling(held_out: HeldOut) -> Ceiling | None:
-    """Return the smallest error on held-out data of all that was tried, and how much of that the named effects do."""
-    linear_um = rms_of(held_out.ceiling)
-    before, after = rms_of(held_out.nothing) ** 2, rms_of(held_out.named) ** 2
-    least = min(linear_um**2, after, rms_of(held_out.whole) ** 2)
-    if least >= before:
+    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
+    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
+    if linear >= before:
         return None
     return Ceiling(
-        rms_um=float(np.sqrt(least)),
-        explained_pct=float(np.clip((before - after) / (before - least), 0, 1)) * 100,
-        linear_rms_um=linear_um,
+        rms_um=float(np.sqrt(linear)),
+        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
+        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
     )
 
 

@@ -53,26 +53,26 @@ class Remainder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ceiling:
-    """The smallest error on data that took no part: by all logged channels, the named effects, or with the remainder.
+    """What the best linear use of all logged channels leaves on data that took no part.
 
     Parameters
     ----------
     rms_um : float
-        That error, µm.
+        Its residual, µm.
     explained_pct : float
         How much of what it removes the named effects remove, %.
-    linear_rms_um : float, optional
-        What the best linear use of all logged channels leaves, µm; None: that is the smallest.
+    least_rms_um : float, optional
+        The smallest residual of this, the named effects, and these with the remainder, µm; None: it is `rms_um`.
     """
 
     rms_um: float
     explained_pct: float
-    linear_rms_um: float | None = None
+    least_rms_um: float | None = None
 
     @property
-    def linear_um(self) -> float:
-        """What the best linear use of all logged channels leaves, µm."""
-        return self.rms_um if self.linear_rms_um is None else self.linear_rms_um
+    def least_um(self) -> float:
+        """The smallest residual of all that was tried, µm."""
+        return self.rms_um if self.least_rms_um is None else self.least_rms_um
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

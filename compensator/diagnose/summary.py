@@ -347,7 +347,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.remainder:
         rows.append(["with the remainder", *diagnosis.after.cells()])
     if diagnosis.ceiling:
-        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.linear_um:.2f}", "", ""])
+        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],

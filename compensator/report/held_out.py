@@ -55,7 +55,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
         bars.append(Bar("with the remainder", f"{after:.2f} µm", 0.0, after, _LEFT))
     edges = [Edges(f"sensor noise, {diagnosis.noise_floor_um:.2f} µm", (diagnosis.noise_floor_um,))]
     if (ceiling := diagnosis.ceiling) is not None:
-        edges.append(Edges(f"ceiling: the smallest error tried, {ceiling.rms_um:.2f} µm", (ceiling.rms_um,)))
+        edges.append(Edges(f"ceiling: the smallest error tried, {ceiling.least_um:.2f} µm", (ceiling.least_um,)))
     return Figure(
         title="Error on held-out data" + (", and what each effect removes" if len(bars) > 1 else ""),
         x_label="rms error on held-out data, µm",

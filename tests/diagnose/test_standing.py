@@ -50,7 +50,7 @@ def found(*runs: dict[str, Any], **changes: Any) -> dict[str, Any]:
         "noise_floor_um": noise,
         "fit": {"before_um": 3.6, "named_um": 0.2, "after_um": 0.2},
         "remainder": None,
-        "ceiling": {"rms_um": 0.2, "explained_pct": 100.0, "linear_rms_um": 0.6},
+        "ceiling": {"rms_um": 0.6, "explained_pct": 100.0, "least_rms_um": 0.2},
         "advice": None,
         "warning_codes": [],
         "free_run": list(runs),
@@ -131,13 +131,13 @@ def test_no_error_is_below_the_ceiling(named: float, whole: float, best: float) 
     one = np.ones(9)
     held_out = HeldOut(nothing=9.0 * one, named=named * one, whole=whole * one, ceiling=4.82 * one, steps=())
     top = _ceiling(held_out)
-    assert top is not None and top.rms_um == pytest.approx(best) and top.linear_um == pytest.approx(4.82)
-    assert top.explained_pct == pytest.approx(100.0 * (81.0 - named**2) / (81.0 - best**2))
+    assert top is not None and top.rms_um == pytest.approx(4.82) and top.least_um == pytest.approx(best)
+    assert top.explained_pct == pytest.approx(min(100.0 * (81.0 - named**2) / (81.0 - 4.82**2), 100.0))
     table = found(
         before={"rms_um": 9.0},
         after={"rms_um": whole},
         remainder={"rms_before_um": named, "rms_after_um": whole, "deployed": True, "channels": []},
-        ceiling={"rms_um": top.rms_um, "explained_pct": top.explained_pct, "linear_rms_um": 4.82},
+        ceiling={"rms_um": top.rms_um, "explained_pct": top.explained_pct, "least_rms_um": top.least_rms_um},
     )
     text = ceiling(table).text()
     assert f"{best:.2f} µm rms" in text and "4.82" in text and "Their error is smaller" not in text

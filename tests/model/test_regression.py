@@ -460,7 +460,7 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
             "instead": False,
             "belongs": False,
         },
-        "ceiling": {"rms_um": 0.8, "explained_pct": 83.0, "linear_rms_um": None},
+        "ceiling": {"rms_um": 0.8, "explained_pct": 83.0, "least_rms_um": None},
     }
     in_file = figures(found)
     assert {key: in_file[key] for key in wanted} == wanted
