@@ -100,7 +100,7 @@ class Background:
             self.made_of = np.asarray(
                 np.kron(np.eye(len(inputs)), np.vstack([np.eye(len(taus) - 1), -np.ones(len(taus) - 1)]))
             )
-        self.columns = of_gains @ self.made_of
+        self.columns = of_gains @ self.made_of if recent else of_gains
         self._of_gains = of_gains
         self.groups = np.repeat(np.arange(len(inputs)), len(taus) - recent)
         # The sizes of the base's own paths are known apart from those of channels.

@@ -377,13 +377,13 @@ def _verdict(
     if not any(observed):
         return "unexplained", False
 
+    most_um2 = rms_of(held_out.nothing) ** 2
+    if evidence.is_sparse:
+        # What few values were fitted by must hold on those that it was not fitted to.
+        most_um2 = min(most_um2, VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count))
+
     def holds(values: Vector) -> bool:
-        um = rms_of(values)
-        if evidence.is_sparse:
-            # What few values were fitted by must hold on those that it was not fitted to.
-            level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
-            return um <= rms_of(held_out.nothing) and um**2 <= level
-        return um <= rms_of(held_out.nothing)
+        return rms_of(values) ** 2 <= most_um2
 
     nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains
     by_names = leaves_noise(found.named) and holds(held_out.named) and all(e.is_determined for e in effects)

@@ -118,15 +118,17 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
     ceiling = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
+    deployed = as_deployed(fit)
     if late_term(fit):
-        remainder, explains = _beside_late(fit), True
+        remainder, explains = _beside_late(deployed[2]), True
     else:
         remainder, explains = _remainder(search, fit, background, refitted, ceiling)
     belongs = remainder is None and _has_own_error(fit)
-    fit = foretelling(fit) if belongs else fit
-    terms, responses, beside = as_deployed(fit)
     if belongs:
-        remainder = own_error(beside)
+        fit = foretelling(fit)
+        deployed = as_deployed(fit)
+        remainder = own_error(deployed[2])
+    terms, responses, _ = deployed
     return Findings(
         search=search,
         selection=selection,
@@ -182,14 +184,18 @@ def _remainder(
     return beside if _is_worth_deploying(beside, known, evidence) else None, True
 
 
-def _beside_late(fit: Fit) -> Regressed | None:
+def _beside_late(corrected: Fit) -> Regressed | None:
     """Return what all channels explain where a late T_Q is corrected as the engine does, if that is worth deploying.
 
     What a dead time hides from T_Q another channel may show at once. The correction stays: others get its signals.
+
+    Parameters
+    ----------
+    corrected : Fit
+        The other effects, of the corrected signals (`as_deployed`).
     """
-    if not fit.likelihood.points.evidence.context.channels:
+    if not corrected.likelihood.points.evidence.context.channels:
         return None
-    _, _, corrected = as_deployed(fit)
     alone = settled(corrected)
     points = alone.likelihood.points
     beside = Background(points.evidence, recent=True).fitted(points, alone.added, alone.rest)

@@ -126,7 +126,7 @@ class Diagnosis:
     remainder : Remainder, optional
         What the channels explain and no named effect does; None where there is none.
     ceiling : Ceiling, optional
-        What could be explained; None where nothing that was tried leaves less than the base model.
+        What all channels could explain; None where no linear use of them leaves less than the base model.
     advice : Advice, optional
         What to measure and to test next; None where the model is adequate.
     could_hide : DetectionLimits, optional

@@ -92,15 +92,14 @@ def test_an_effect_below_its_standard_error_is_undecided() -> None:
     assert "found" not in headline(table) and tone_of(table) == "warn"
 
 
+def rest_of(before_um: float, after_um: float, **changes: bool) -> dict[str, Any]:
+    """The remainder of a diagnosis, deployed."""
+    figures = {"rms_before_um": before_um, "rms_after_um": after_um}
+    return {"deployed": True, "channels": ["at_degc"], "instead": False, "belongs": False} | figures | changes
+
+
 def test_where_the_remainder_does_the_work_it_is_said() -> None:
-    rest = {
-        "deployed": True,
-        "channels": ["at_degc"],
-        "rms_before_um": 2.35,
-        "rms_after_um": 0.17,
-        "instead": False,
-        "belongs": True,
-    }
+    rest = rest_of(2.35, 0.17, belongs=True)
     fit = {"before_um": 5.62, "named_um": 2.28, "after_um": 0.16}
     table = found(fresh(5.0, 0.2), verdict="partly_explained", remainder=rest, fit=fit)
     words = headline(table)
@@ -113,15 +112,7 @@ def test_where_the_remainder_does_the_work_it_is_said() -> None:
 
 
 def test_a_remainder_that_increases_the_held_out_error_says_so_and_why_it_is_deployed() -> None:
-    rest = {
-        "deployed": True,
-        "channels": ["at_degc"],
-        "rms_before_um": 4.7,
-        "rms_after_um": 6.37,
-        "instead": True,
-        "belongs": False,
-    }
-    text = remainder(found(remainder=rest))[0].text()
+    text = remainder(found(remainder=rest_of(4.7, 6.37, instead=True)))[0].text()
     assert "It increases the error there." in text and "all data are more probable with it" in text
     assert "removes nothing" not in text and "4.70 µm rms with the named effects, 6.37 with it in their place" in text
 
