@@ -468,6 +468,11 @@ class ModelWarning(Code):
         "The effects that were found increase the error on held-out data, so the model was left unchanged.",
         "Record for longer, with more change in the inputs.",
     )
+    WORSE_FROM_REST = (
+        "worse_from_rest",
+        "The effects that were found increase the error of their own data in free run: the model was left unchanged.",
+        "Record a run that begins at rest, with more change in the inputs.",
+    )
     NOT_CONFIRMED = (
         "not_confirmed",
         "The effects are clear in all data together, but a search without a block of time does not predict it.",

@@ -44,7 +44,7 @@ class Unexplained:
         A source that is switched and that no channel shows; what the channels explain and no named effect does; or what
         nothing explains.
     rms_um, peak_to_peak_um : float
-        Its size, µm.
+        Its size, µm; `rms_um` without the noise of the data.
     tau_min : float
         Its time constant, min.
     times : tuple of (int, float)
@@ -94,7 +94,7 @@ class Advice:
     nearest : tuple of Near
         Logged channels that come nearest to it (where nothing is hidden: to what a named temperature explains).
     sensor : str
-        Where the next sensor should sit; empty where none is needed.
+        Where the next sensor should sit; empty where nothing is left, or less than the noise of a sample.
     tests : tuple of PlannedTest
         Tests to run, the next one first.
     seen_once : tuple of SeenOnce
@@ -138,12 +138,14 @@ def advice_of(
         near = nearest(fit, found.selection.before.rest)[:LISTED]
     # A test that decides comes before one that would not.
     tests = sorted(between_rivals, key=lambda test: not test.decides)
-    if unexplained is not None and unexplained.kind != "remainder":
+    # For what a single reading does not show nobody places a sensor.
+    needs_sensor = unexplained is not None and unexplained.rms_um >= found.search.evidence.noise.noise_um
+    if unexplained is not None and needs_sensor and unexplained.kind != "remainder":
         tests.insert(0, _shown_again(unexplained, fit, deciding))
     return Advice(
         unexplained=unexplained,
         nearest=near,
-        sensor=_sensor(unexplained, near) if unexplained else "",
+        sensor=_sensor(unexplained, near) if unexplained and needs_sensor else "",
         tests=tuple(tests),
         seen_once=tuple(_seen_once(fit, deciding)),
     )
@@ -184,6 +186,7 @@ def _described(
 ) -> Unexplained:
     evidence = found.search.evidence
     used = course[evidence.used]
+    noise_um = evidence.noise.noise_um if kind == "residual" else 0.0
     times = sorted(switched or steepest(evidence, course, TIMES))
     tolerance = max(MEET_SAMPLES * evidence.context.period_min, min(MEET_SHARE * tau_min, MEET_MIN))
     event = goes_with(evidence, times, tolerance if switched else MEET_MIN)
@@ -191,7 +194,7 @@ def _described(
         event = GoesWith(event=DAY)
     return Unexplained(
         kind=kind,
-        rms_um=float(np.std(used)),
+        rms_um=float(np.sqrt(max(float(np.var(used)) - noise_um**2, 0.0))),
         peak_to_peak_um=float(np.ptp(used)),
         tau_min=tau_min,
         times=tuple((run, float(at) / 60.0) for run, at in times[:TIMES]),

@@ -66,14 +66,14 @@ class Criterion:
         """Return what the effects of a fit must add to the evidence."""
         return sum(self.cost_of(term.hypothesis) for term in fit.terms)
 
-    def left(self, fit: Fit) -> Vector:
-        """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
-        left = self._evidence.residual - summed(self._evidence, fit.terms)
+    def left(self, terms: Sequence[Term]) -> Vector:
+        """Return what effects leave on every sample, nuisances projected out, µm; 0 where samples are not used."""
+        left = self._evidence.residual - summed(self._evidence, terms)
         return self._evidence.without_nuisances(np.where(self._evidence.used, left, 0.0))
 
-    def rms(self, fit: Fit) -> float:
-        """Return the rms of what a fit leaves, µm."""
-        return float(np.sqrt(np.sum(self.left(fit) ** 2) / self._evidence.count))
+    def rms(self, terms: Sequence[Term]) -> float:
+        """Return the rms of what effects leave, µm."""
+        return float(np.sqrt(np.sum(self.left(terms) ** 2) / self._evidence.count))
 
     def compared(self, fit: Fit) -> float:
         """Return the rms of what a fit leaves beside what its choice granted, µm: what rivals are compared by.
@@ -84,7 +84,7 @@ class Criterion:
         likelihood = fit.likelihood
         points = likelihood.points
         if points.is_exact and not self._evidence.free_paths:
-            return self.rms(fit)
+            return self.rms(fit.terms)
         left = points.residual - fit.added - points.random(fit.rest) @ likelihood.weights(fit.added)
         return float(np.sqrt(np.mean(left**2)))
 
@@ -102,7 +102,7 @@ class Criterion:
 
     def leaves_noise(self, fit: Fit) -> bool:
         """Return whether what a fit leaves may be noise alone."""
-        return self._evidence.noise.is_explained(self.rms(fit) ** 2 * self._evidence.count)
+        return self._evidence.noise.is_explained(self.rms(fit.terms) ** 2 * self._evidence.count)
 
     def is_expected(self, fit: Fit) -> bool:
         """Return whether what is left may come by itself on another day, where the calibration states its error.
@@ -114,7 +114,7 @@ class Criterion:
             self._evidence.expected <= fit.places
             and noise.own_error_um > 0.0
             and not self._evidence.is_sparse
-            and noise.is_expected(self.rms(fit) ** 2 * self._evidence.count)
+            and noise.is_expected(self.rms(fit.terms) ** 2 * self._evidence.count)
         )
 
     def is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
@@ -126,7 +126,7 @@ class Criterion:
         share = effect.worth_with_others if others else effect.worth
         added = np.where(self._evidence.used, response(self._evidence, term), 0.0)
         size = float(np.sum(self._evidence.without_nuisances(added) ** 2))
-        left = (self.rms(without) ** 2) * self._evidence.count + self._evidence.noise.allowance
+        left = (self.rms(without.terms) ** 2) * self._evidence.count + self._evidence.noise.allowance
         return size > share * left
 
     def is_plausible(self, term: Term) -> bool:

@@ -21,7 +21,7 @@ from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of, with_paths
+from compensator.diagnose.findings import Findings, findings_of, from_rest, with_paths
 from compensator.diagnose.fit import Term, fit_terms, late_term
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
@@ -42,7 +42,8 @@ from compensator.progress import ExecutorMap, Progress, unreported
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
 #: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor: the base's paths are
-#: kept, or fitted anew, where each block knows less of them than the whole.
+#: kept, or fitted anew, where each block knows less of them than the whole. The first one holds for the data that were
+#: searched, too, in free run from rest.
 CONTRADICTS = (1.25, 2.5)
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
@@ -97,7 +98,10 @@ def diagnose(
     factor = CONTRADICTS[evidence.free_paths]
     contradicted = not few and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
     reverses = any(effect.reverses_path for effect in effects)
-    extended, remarks = (model, ()) if contradicted or reverses else _extended(model, found, effects)
+    base_um, own_um = from_rest(found)
+    worse = (base_um, own_um) if not few and own_um > CONTRADICTS[False] * base_um else None
+    refused = contradicted or reverses or worse is not None
+    extended, remarks = (model, ()) if refused else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
     (verdict, is_explained), ceiling = _verdict(found, effects, held_out, extended), _ceiling(held_out)
@@ -115,7 +119,7 @@ def diagnose(
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
-        effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, start_k=evidence.start_k
+        effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, from_rest=worse, start_k=evidence.start_k
     )
     return Diagnosis(
         verdict="unexplained" if hides or reverses else verdict,

@@ -16,7 +16,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
-from compensator.diagnose.search import Search, Selection
+from compensator.diagnose.search import MOSTLY, Search, Selection
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
 from compensator.model.thermal_model import Path, ThermalModel
@@ -110,6 +110,18 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
     grid : Grid, optional
         That of a search over all data, where something is held out.
     """
+    found = _findings_of(evidence, grid, unobserved=unobserved)
+    if any(not term.effect.observed for term in found.terms) and _is_worse(found):
+        # The effects make up for the source. Channels that explain most of it alone take their place.
+        shown = _findings_of(evidence, grid, unobserved=False)
+        rms = found.search.criterion.rms
+        nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
+        if nothing - left > MOSTLY * (nothing - hidden):
+            return shown
+    return found
+
+
+def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> Findings:
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
     fit, points = selection.fit, search.points
@@ -142,6 +154,34 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
         paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
         refitted=refitted,
     )
+
+
+def from_rest(found: Findings) -> tuple[float, float]:
+    """Return what is left of the data in free run by the base model and with what can be deployed, µm rms.
+
+    Only the zero of each run is unknown, and a source that no channel shows is missing: so it runs in service. What
+    depends on time alone is an error of the measurement and counts neither way.
+    """
+    evidence = found.search.evidence
+    hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
+    for term, added in zip(found.terms, found.responses, strict=True):
+        if not term.effect.observed:
+            hidden += added
+        elif not term.effect.deployable:
+            of_time += added
+    if evidence.free_paths:  # the residual is all of y
+        base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
+
+    def left_um(added: Vector) -> float:
+        left = evidence.left(evidence.residual - of_time, added, at_rest=True)[evidence.used]
+        return float(np.sqrt(np.mean(left**2)))
+
+    return left_um(base), left_um(found.whole - (hidden + of_time) * found.explains)
+
+
+def _is_worse(found: Findings) -> bool:
+    before_um, after_um = from_rest(found)
+    return after_um > before_um
 
 
 def _has_own_error(fit: Fit) -> bool:

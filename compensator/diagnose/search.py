@@ -32,7 +32,8 @@ DOUBT = 4.5
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
 ALIAS_FREE = 3.0
-#: A simpler effect on the same path gives its name where it explains this share of what a background effect explains.
+#: A simpler effect gives its name where it explains this share of what a background effect explains, and so do channels
+#: in place of a source that no channel shows and that makes up for the effects beside it.
 MOSTLY = 0.7
 
 
@@ -265,13 +266,13 @@ class Search:
             if term.hypothesis.effect.background or (
                 self.evidence.context.approximate and term.hypothesis.effect.kind == "dynamics"
             ):
-                without = self.criterion.rms(fit_terms(fit.likelihood, fit.starts(i), evaluations=1)) ** 2
-                all_of_it = without - self.criterion.rms(fit) ** 2
+                without = self.criterion.rms(fit_terms(fit.likelihood, fit.starts(i), evaluations=1).terms) ** 2
+                all_of_it = without - self.criterion.rms(fit.terms) ** 2
                 for hypothesis in self.hypotheses:
                     if hypothesis.effect.names_background and hypothesis.place not in fit.places:
                         starts = [*fit.starts(i)[:i], (hypothesis, ()), *fit.starts(i)[i:]]
                         simple = settled(fit_terms(fit.likelihood, starts))
-                        if without - self.criterion.rms(simple) ** 2 > MOSTLY * all_of_it:
+                        if without - self.criterion.rms(simple.terms) ** 2 > MOSTLY * all_of_it:
                             return simple
         return fit
 

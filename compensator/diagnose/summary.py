@@ -57,7 +57,12 @@ _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
     "left unchanged."
 )
-#: The same of few values, which do not decide what is deployed.
+#: The verdict if they increase the error of their own data in free run.
+_NOT_IN_FREE_RUN = (
+    "The model lacks an effect; the best explanation found increases the error in free run over the same data, so the "
+    "model was left unchanged."
+)
+#: The verdict if the effects found do not predict held-out values, which decide nothing where they are few.
 _NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
 #: The verdict if nothing was named and the channels show some of what acts.
 _WITHOUT_A_NAME = "The model lacks an effect that has no name here; the logged channels show some of it."
@@ -224,6 +229,8 @@ def _words(found: Mapping[str, Any]) -> str:
         words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
     if ModelWarning.PATH_REVERSED in found["warning_codes"]:
         words = _REVERSED
+    elif ModelWarning.WORSE_FROM_REST in found["warning_codes"]:
+        words = _NOT_IN_FREE_RUN
     elif ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     elif ModelWarning.NOT_CONFIRMED in found["warning_codes"] and "could_hide" in found:

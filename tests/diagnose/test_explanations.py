@@ -115,5 +115,5 @@ def test_a_path_is_named_with_what_it_does() -> None:
     seen = Seen(rms_um=2.0, added_um=Range(-1.5, 8.2), path_um=Range(-10.0, 54.6))
     words = effect_from("gain", {"path": "DTF", "change": 0.15}).explain(seen)
     assert words.startswith(
-        "−1.5 to +8.2 µm (2.0 µm rms): the gain of the DTF, which moves Y by −10 to +55 µm, is 15 % too low."
+        "−1.5 to +8.2 µm (2.0 µm rms): the model's gain of the DTF, which moves Y by −10 to +55 µm, is 15 % too low."
     )

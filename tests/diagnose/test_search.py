@@ -183,6 +183,12 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
     assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
+    # The same where its own data contradict what would be deployed, in free run.
+    times = 0.1
+    monkeypatch.setattr(diagnosis_module, "from_rest", lambda _: (1.0, 1.3))
+    bad = diagnose(QUILL, runs_from(columns))
+    assert not bad.model.effects and "worse_from_rest" in [warning.code for warning in bad.warnings]
+    assert "in free run over the same data" in verdict(figures(bad))
 
 
 def test_two_effects_that_are_known_only_together_are_not_known_apart():

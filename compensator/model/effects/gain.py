@@ -26,10 +26,12 @@ class Gain(Effect):
 
     def explain(self, seen: Seen) -> str:
         if self.change < -1.0:
-            return f"{seen.words}: Y moves against the {self.path}{seen.path_words}. Check the sign of measured Y."
+            path = f"{self.path}{seen.path_words}".removesuffix(",")
+            return f"{seen.words}: Y moves against the {path}. Check the sign of measured Y."
         return (
-            f"{seen.words}: the gain of the {self.path}{seen.path_words} is {digits(abs(100.0 * self.change))} % too "
-            f"{'low' if self.change > 0 else 'high'}. The machine responds differently than during calibration."
+            f"{seen.words}: the model's gain of the {self.path}{seen.path_words} is "
+            f"{digits(abs(100.0 * self.change))} % too {'low' if self.change > 0 else 'high'}. "
+            "The machine responds differently than during calibration."
         )
 
 
