@@ -48,7 +48,7 @@ def test_a_configured_model_without_its_channel_is_named_too(tmp_path: Path, cap
     assert "[[channel]]" in capfd.readouterr().out
 
 
-@pytest.mark.usefixtures("equal_questions_once")
+@pytest.mark.usefixtures("without_pictures", "equal_questions_once")
 def test_a_diagnosis_prints_the_lines_of_the_channels_it_adds(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

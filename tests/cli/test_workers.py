@@ -85,6 +85,7 @@ def test_a_cluster_audits_and_finds_what_one_process_does(
     assert found(["replay", ".", "--scheduler", scheduler], capsys) == edited
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_cluster_and_all_cores_diagnose_as_one_process_does(
     tmp_path: Path,
     table: Path,
