@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import os
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from compensator.blas import one_thread_from_start
+from tests.shared_folder import search_once
 
 # As the commands do, before a test loads numpy: the processes of a test run share the cores.
 one_thread_from_start()
@@ -29,6 +31,13 @@ def _no_wait_for_the_disk(descriptor: int) -> None:
 
 
 os.fsync = _no_wait_for_the_disk
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector leave out what stays: modules and tests, half a million objects at each full round."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +57,16 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     For tests of figures and words that other tests have drawn: `report/` draws the page of every command.
     """
     monkeypatch.setattr("compensator.report.page.svg", lambda figure, prefix, width=0.0: f'<svg id="{prefix}"></svg>')
+
+
+@pytest.fixture
+def equal_questions_once(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Search once in a test run for what the same model lacks in data that are equal to the bit.
+
+    For tests of what commands and verbs ask and of what they make of the answer. That a search finds the same each time
+    and in each process is for `cli/test_workers.py` and `reference/`.
+    """
+    search_once(monkeypatch, tmp_path_factory)
 
 
 _drawn: dict[bytes, str] = {}

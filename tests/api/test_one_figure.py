@@ -18,7 +18,7 @@ from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import CALIBRATION_W
 
 #: The figure is a number in words here; no picture is looked at.
-pytestmark = pytest.mark.usefixtures("without_pictures")
+pytestmark = pytest.mark.usefixtures("without_pictures", "equal_questions_once")
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import contextlib
 import csv
 import io
 import json
-import pickle
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +24,7 @@ from tests.api.tables import arrays, by_time, frame, write_run
 from tests.audit.made import Service
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
+from tests.shared_folder import search_once
 
 FORMS: dict[str, Callable[[Path], Any]] = {
     "path": lambda path: path,
@@ -41,21 +41,6 @@ long_forms = pytest.mark.parametrize("form", [form for form in FORMS if form != 
 
 
 pytestmark = pytest.mark.usefixtures("equal_pictures_once")
-_found: dict[bytes, Any] = {}
-
-
-@pytest.fixture
-def equal_questions_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search once for what the same model lacks in data that are equal to the bit; the command has searched itself."""
-    find = diagnosis.find_effects
-
-    def once(model: Any, runs: Any, **settings: Any) -> Any:
-        key = pickle.dumps((model, runs, settings["expected"]))
-        if key not in _found:
-            _found[key] = find(model, runs, **settings)
-        return _found[key]
-
-    monkeypatch.setattr(diagnosis, "find_effects", once)
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +91,10 @@ def identified(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 @pytest.fixture(scope="module")
-def diagnosed(folder: Path) -> tuple[dict[str, Any], str]:
-    return command("diagnose", folder / "effect.csv", "--model", "quill", "--out", folder / "diagnosis")
+def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], str]:
+    with pytest.MonkeyPatch.context() as patch:
+        search_once(patch, tmp_path_factory)
+        return command("diagnose", folder / "effect.csv", "--model", "quill", "--out", folder / "diagnosis")
 
 
 def as_json(found: dict[str, Any]) -> dict[str, Any]:

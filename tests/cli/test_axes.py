@@ -91,6 +91,7 @@ def test_wrong_axes_are_refused_in_one_line(folder, capsys):
         assert words in said and said.count("\n") == 1
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_role_gives_an_axis_its_column(folder):
     table = machine(axes=("z",))
     table["probe_5"] = table.pop("z_um")

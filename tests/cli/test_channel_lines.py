@@ -48,12 +48,13 @@ def test_a_configured_model_without_its_channel_is_named_too(tmp_path: Path, cap
     assert "[[channel]]" in capfd.readouterr().out
 
 
+@pytest.mark.usefixtures("without_pictures", "equal_questions_once")
 def test_a_diagnosis_prints_the_lines_of_the_channels_it_adds(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     columns, _, _ = record([draw("input", 4)], 79, 10.0)
-    write_table(tmp_path / "run.csv", {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
-    assert main(["diagnose", str(tmp_path / "run.csv"), "--model", "quill", "--out", str(tmp_path / "d")]) == 0
+    write_table(tmp_path / "effect.csv", {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
+    assert main(["diagnose", str(tmp_path / "effect.csv"), "--model", "quill", "--out", str(tmp_path / "d")]) == 0
     out = capfd.readouterr().out
     listed = out[out.index("[[channel]]") :].split("\n\nmodel:")[0].split("\n\n")[0]
     (channel,) = tomllib.loads(listed)["channel"]

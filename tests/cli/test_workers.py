@@ -18,6 +18,7 @@ from compensator.commands import diagnose as diagnose_command
 from compensator.demo.calibration import write_table
 from tests.audit.made import START_NS, Service
 from tests.diagnose.scenarios import draw, record
+from tests.shared_folder import search_once
 
 MINUTE_NS = 60_000_000_000
 CLUSTER = """
@@ -50,7 +51,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     columns, _, _ = record([draw("input", 4)], 79, 10.0)
-    path = tmp_path_factory.mktemp("data") / "run.csv"
+    path = tmp_path_factory.mktemp("data") / "effect.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
     return path
 
@@ -84,10 +85,18 @@ def test_a_cluster_audits_and_finds_what_one_process_does(
     assert found(["replay", ".", "--scheduler", scheduler], capsys) == edited
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_cluster_and_all_cores_diagnose_as_one_process_does(
-    tmp_path: Path, table: Path, scheduler: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    table: Path,
+    scheduler: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    alone = diagnosed(table, tmp_path / "alone", capsys)
+    with monkeypatch.context() as patch:
+        search_once(patch, tmp_path_factory)
+        alone = diagnosed(table, tmp_path / "alone", capsys)
     assert diagnosed(table, tmp_path / "cluster", capsys, "--scheduler", scheduler) == alone
     monkeypatch.setattr(diagnose_command, "ALONE", 0)
     assert diagnosed(table, tmp_path / "cores", capsys) == alone

@@ -36,6 +36,7 @@ def test_every_command_exists_with_its_options(words):
     assert refusal(_parser(), words[1:]) == ""
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_cycle_from_probes_to_a_checked_model(tmp_path, monkeypatch, capsys):
     """The guide's own lines, with tables in the place of the recordings of its days."""
     monkeypatch.chdir(tmp_path)

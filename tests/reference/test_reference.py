@@ -104,6 +104,7 @@ def test_simulate(name: str, tmp_path: Path) -> None:
     check_columns(wanted["columns"], found["columns"], SAME)
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("name", EXPECTED["identify"])
 def test_identify(name: str, tmp_path: Path) -> None:
     wanted = EXPECTED["identify"][name]
@@ -113,6 +114,7 @@ def test_identify(name: str, tmp_path: Path) -> None:
     check(kept.model_table(kept.KEPT / "identify" / f"{name}.toml"), kept.model_table(tmp_path / "model.toml"), FITTED)
 
 
+@pytest.mark.usefixtures("without_pictures", "equal_questions_once")
 @pytest.mark.parametrize("name", EXPECTED["diagnose"])
 def test_diagnose(name: str, tmp_path: Path) -> None:
     """From the published model, from one that version 0.1.0 identified, and over one of its recordings.
@@ -139,6 +141,7 @@ def test_diagnose(name: str, tmp_path: Path) -> None:
         assert set(old) <= set(new)
 
 
+@pytest.mark.usefixtures("without_pictures", "equal_questions_once")
 def test_the_linear_coolant_is_found_as_it_acts(tmp_path: Path) -> None:
     """The table has 3 µm/K with a lag of 31 min, see `tables.py`; version 0.1.0 found its square."""
     _, result = kept.diagnosed("quill", tmp_path)

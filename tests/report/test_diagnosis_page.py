@@ -28,6 +28,9 @@ from compensator.report.results import pages_in
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
 
+#: Words and numbers of many pages with the same figures.
+pytestmark = pytest.mark.usefixtures("equal_pictures_once")
+
 QUILL = load_model("quill")
 REMAINDER = Remainder(deployed=True, channels=("t1_degc", "base_degc"), rms_before_um=1.4, rms_after_um=0.9)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -25,46 +27,69 @@ def member(node: ast.AST) -> Code | None:
     return None if domain is None else domain.__members__.get(node.attr)
 
 
+class Source(NamedTuple):
+    """Codes, texts as far as a colon, what each remark is made of, lines of warnings without a code."""
+
+    path: Path
+    codes: frozenset[Code]
+    texts: frozenset[str]
+    remarks: tuple[ast.expr, ...]
+    unmarked: tuple[int, ...]
+
+
+@functools.cache
+def sources() -> tuple[Source, ...]:
+    """The sources, each read once."""
+    return tuple(source(path) for root in ("compensator", "drivers") for path in (PACKAGE.parent / root).rglob("*.py"))
+
+
+def source(path: Path) -> Source:
+    """Read a source."""
+    codes, texts, remarks, unmarked = set[Code](), set[str](), list[ast.expr](), list[int]()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute):
+            if (code := member(node)) is not None:
+                codes.add(code)
+        elif isinstance(node, ast.Constant):
+            if isinstance(node.value, str):
+                texts.add(node.value.partition(":")[0])
+        elif isinstance(node, ast.Call):
+            if getattr(node.func, "id", "") == "Remark":
+                remarks.append(node.args[0])
+            if getattr(node.func, "attr", "") == "warning":
+                last = node.args[-1]
+                if not (isinstance(last, ast.Attribute) and last.attr == "marked"):
+                    unmarked.append(node.lineno)
+    return Source(path, frozenset(codes), frozenset(texts), tuple(remarks), tuple(unmarked))
+
+
 def remarks() -> set[str]:
     """Codes of all warnings that the sources make."""
     found = set()
-    for path in PACKAGE.rglob("*.py"):
-        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        for node in nodes:
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Remark":
-                if isinstance(node.args[0], ast.Name):  # handed over: any code that the module names
-                    found |= {str(code) for code in map(member, nodes) if code is not None}
-                    continue
-                code = member(node.args[0])
-                assert code is not None, f"{path}: {node.lineno}: a code that is not a member of its domain"
-                found.add(str(code))
+    for one in sources():
+        if PACKAGE not in one.path.parents:
+            continue
+        for made in one.remarks:
+            if isinstance(made, ast.Name):  # handed over: any code that the module names
+                found |= {str(code) for code in one.codes}
+                continue
+            code = member(made)
+            assert code is not None, f"{one.path}: {made.lineno}: a code that is not a member of its domain"
+            found.add(str(code))
     return found
 
 
 def test_every_warning_in_the_log_has_a_code() -> None:
-    for path in sorted(PACKAGE.rglob("*.py")):
-        if PACKAGE / "receiver" in path.parents:  # stands alone, with codes of its own
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "warning":
-                last = node.args[-1]
-                assert isinstance(last, ast.Attribute) and last.attr == "marked", f"{path}: {node.lineno}"
+    for one in sources():
+        # The receiver stands alone, with codes of its own.
+        if PACKAGE in one.path.parents and PACKAGE / "receiver" not in one.path.parents:
+            assert not one.unmarked, f"{one.path}: {one.unmarked}"
 
 
 def written() -> set[str]:
     """Texts in the sources, as far as a colon, and codes that they name, without those of the tables of words."""
-    found = set()
-    for root in ("compensator", "drivers"):
-        for path in (PACKAGE.parent / root).rglob("*.py"):
-            if path != PACKAGE / "codes.py":
-                tree = ast.parse(path.read_text(encoding="utf-8"))
-                found |= {str(code) for node in ast.walk(tree) if (code := member(node)) is not None}
-                found |= {
-                    node.value.partition(":")[0]
-                    for node in ast.walk(tree)
-                    if isinstance(node, ast.Constant) and isinstance(node.value, str)
-                }
-    return found
+    told = [one for one in sources() if one.path != PACKAGE / "codes.py"]
+    return {str(code) for one in told for code in one.codes} | {text for one in told for text in one.texts}
 
 
 def test_no_code_is_left_over() -> None:
@@ -78,13 +103,11 @@ def test_every_code_that_is_shown_has_its_sentences() -> None:
         assert means.endswith(".") and do.endswith(".") and means != do, code
 
 
-@pytest.mark.parametrize(
-    "code", sorted(remarks() | {"hold", "silent", "unknown", "torn", "altered", "outside_validity"})
-)
-def test_explain_says_the_same(code: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["explain", code, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["means"], said["do"]) == WORDS[code]
+def test_explain_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    for code in sorted(remarks() | {"hold", "silent", "unknown", "torn", "altered", "outside_validity"}):
+        assert main(["explain", code, "--json"]) == 0, code
+        said = json.loads(capsys.readouterr().out)
+        assert (said["means"], said["do"]) == WORDS[code], code
 
 
 @pytest.mark.parametrize(

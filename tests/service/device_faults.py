@@ -19,14 +19,14 @@ import numpy as np
 from compensator.messages import Offset, Sample, number
 from compensator.model.model_file import load_model
 from compensator.service.compensation import Compensation, Outcome
-from sim_hardware.physics import Duty, PublishedQuill, SensorSpec, World
+from sim_hardware.physics import PublishedQuill, SensorSpec, World
 from sim_hardware.wire import Rack
 from sim_hardware.wire.capancdt import CAPANCDT_FAULTS
 from sim_hardware.wire.dcon import DCON_FAULTS
 from sim_hardware.wire.faults import INPUT_FAULTS
 from sim_hardware.wire.modbus_servers import RTU_FAULTS, TCP_FAULTS
 from tests.service.records import sample
-from tests.service.simulated import CHANNELS, TABLE, config
+from tests.service.simulated import CHANNELS, TABLE, config, working_day
 from tests.service.wired import Receiver, WiredMachine
 
 ROLES = ("t_q_degc", "at_degc", "y_um")
@@ -152,8 +152,7 @@ class Course:
 
 def make_world() -> World:
     """A machine whose sensors have no noise, so that every number can be checked."""
-    duty = Duty.working_day(1, hours=48.0)
-    return World(PublishedQuill(), duty, {name: SensorSpec() for name in CHANNELS[:3]}, 1)
+    return World(PublishedQuill(), working_day(1, 48.0), {name: SensorSpec() for name in CHANNELS[:3]}, 1)
 
 
 @functools.cache

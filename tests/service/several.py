@@ -113,6 +113,12 @@ def model_text(*names: str, parts: Mapping[str, ThermalModel] | None = None) -> 
     return dump_axes(models).encode()
 
 
+@functools.cache
+def _parsed(text: bytes) -> Config:
+    """A configuration, which every poll asks for and nobody changes."""
+    return parse_config(text, source="test")
+
+
 class SeveralAxes:
     """A service of several axes on a machine, by default without sensor noise."""
 
@@ -137,7 +143,7 @@ class SeveralAxes:
 
     @property
     def config(self) -> Config:
-        return parse_config(self.text, source="test")
+        return _parsed(self.text)
 
     @property
     def recordings(self) -> list[Path]:

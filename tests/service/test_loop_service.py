@@ -96,7 +96,7 @@ class Looping(Machine):
         keep = math.exp(-0.5 / 60.0)
         if not self.lag:
             self.lag[0] = 0.0
-        for i in range(max(self.lag) + 1, now + 1):
+        for i in range(len(self.lag), now + 1):
             driven = self.coolant_degc(max(i - 10, 0)) - self.coolant_degc(0)
             self.lag[i] = keep * self.lag[i - 1] + (1.0 - keep) * driven
         return 3.0 * self.acts(now // 2) * self.lag[now]

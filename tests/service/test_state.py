@@ -84,15 +84,16 @@ def test_every_kind_of_effect_that_streams_is_among_them() -> None:
 def test_restored_after_every_sample_goes_on_with_the_same_bits(name: str) -> None:
     """By induction: if one step from a restored state gives the same outcome and the same state, all steps do."""
     whole = Compensation(CONFIG, MODELS[name])
-    seen: set[str] = set()
+    state, seen = whole.state(), set[str]()
     for raw in day(400, lost=LOST):
         restored = Compensation(CONFIG, MODELS[name])
-        restored.restore(whole.state())
+        restored.restore(state)
         for one in (whole, restored):
             commanded(one, raw.seq)
         outcome = whole.process(raw)
         assert bits(restored.process(raw)) == bits(outcome), raw.seq
-        assert restored.state() == whole.state(), raw.seq
+        state = whole.state()
+        assert restored.state() == state, raw.seq
         seen |= {outcome.offset.state, *outcome.offset.reasons}
     # The day goes through everything that the state must remember, or the test would prove nothing.
     assert {"degraded", "hold", "operator_hold", "internal_error", "predicting", "cold_start"} <= seen

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pytest
 import zenoh
 
 import drivers
@@ -50,8 +51,15 @@ KINDS: dict[str, type] = {"offset": Offset, "sample": Sample, "event": Event}
 KEYS = {"offset": "thermal/y/offset", "sample": "thermal/sample", "event": "thermal/event"}
 
 
+def _patient(settings: Zenoh) -> zenoh.Config:
+    """Return settings whose links outlast what a test waits for: on a busy computer nobody may answer for 10 s."""
+    config = session_config(settings)
+    config.insert_json5("transport/link/tx/lease", str(round(2e3 * PATIENCE_S)))
+    return config
+
+
 class Receiver:
-    """Everything that one subscriber gets, by machine."""
+    """Everything that one subscriber gets, by machine; services that publish to it keep their link as it does."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:
@@ -60,14 +68,17 @@ class Receiver:
         self.got: dict[tuple[str, str], list[Any]] = defaultdict(list)
         self._arrived = threading.Condition()
         self._session: Any = None
+        self._patch = pytest.MonkeyPatch()
 
     def __enter__(self) -> Receiver:
-        self._session = zenoh.open(session_config(Zenoh(prefix="x", listen=[self.endpoint])))
+        self._patch.setattr("compensator.service.publisher.session_config", _patient)
+        self._session = zenoh.open(_patient(Zenoh(prefix="x", listen=[self.endpoint])))
         for name, key in KEYS.items():
             self._session.declare_subscriber(f"shop/*/{key}", lambda sample, name=name: self._take(name, sample))
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._patch.undo()
         self._session.close()
 
     def _take(self, name: str, sample: Any) -> None:
