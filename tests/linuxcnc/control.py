@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import re
 import socket
 import stat
 import subprocess
@@ -37,8 +38,15 @@ STARTS = "LinuxCNC is up"
 #: What LinuxCNC reports when the computer is so busy that its motion controller does not take a command in time; the
 #: command is lost, or comes later.
 STARVED = "USRMOT: ERROR: command timeout"
+#: It reports how long its task took where that is too long; beyond this it was starved, too, s.
+_TASK, _TASK_S = re.compile(r"task: main loop took (\d+\.\d+) seconds"), 0.5
 #: Longest time that the panel takes for an answer, s; a block of a program may take a minute.
 ANSWER_S = 120.0
+
+
+def is_starved(said: str) -> bool:
+    """Whether LinuxCNC reports that the computer was too busy for it."""
+    return STARVED in said or any(float(took) > _TASK_S for took in _TASK.findall(said))
 
 
 class Period(NamedTuple):
@@ -248,7 +256,7 @@ def linuxcnc(
             process.wait(timeout=60)
         except BaseException:
             said = log.read_text(errors="replace")
-            sys.stderr.write(f"{STARVED}\n{said[-6000:]}" if STARVED in said else said[-6000:])
+            sys.stderr.write(f"{STARVED}\n{said[-6000:]}" if is_starved(said) else said[-6000:])
             raise
         finally:
             control.close()
