@@ -67,14 +67,17 @@ def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
-def test_a_candidate_gives_its_place_to_other_effects_of_a_later_diagnosis_if_nothing_can_be_compared() -> None:
+def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_shown_stays_theirs() -> None:
     loop, now_ns = watching(ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED))
     running = loop.state.diagnosis
     loop.shadow_begins("c" * 64, ["delay:DTF"], now_ns - HOUR_NS)
     loop.state.diagnosis = running
-    assert loop.state.found is not None
-    loop.state.found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
-    assert follows(loop, now_ns) == ("shadow", "replaced")
+    (first,) = loop.state.found
+    shown = first.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
+    assert follows(loop, now_ns) == ("shadow", "")
     loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-    # What other effects have shown does not count for it.
-    assert loop.state.found.sha256 == "b" * 64 and loop.state.found.verdict.verdict == "not_judged"
+    assert [(place.sha256[0], place.verdict.verdict) for place in loop.state.found] == [
+        ("c", "alike"),
+        ("b", "not_judged"),
+    ]
+    assert loop.state.found[0].verdict == shown and loop.state.candidate is first
