@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.service.loop.compared import Compared
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
-from compensator.service.transfer.comparison import SURE_PART
+from compensator.service.loop.state import Place
+from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
@@ -81,3 +86,22 @@ def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_
         ("b", "not_judged"),
     ]
     assert loop.state.found[0].verdict == shown and loop.state.candidate is first
+
+
+@pytest.mark.parametrize("right_from", [0, 40])
+def test_newer_parameters_are_judged_by_all_hours_or_by_their_own_whichever_show_more(right_from: int) -> None:
+    """The effect acts all the time, or from the beginning of their own hours on."""
+    takes_over, now = 40, 56
+    rng = np.random.default_rng(8)
+    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
+    for n in range(now):
+        moves, error = 2.0 * float(rng.normal()), 0.3 * float(rng.normal())
+        own, other = (moves + error, error) if n >= right_from else (error, error - moves)
+        zero = int(n >= takes_over)
+        place.comparison.blocks.append(Block(zero, n, 30, (30 * own**2, 30 * other**2), (own, other, moves)))
+    place.comparison.zeros, place.comparison.model_ns = 1, takes_over * BLOCK_NS
+    place.comparison.first_ns, place.comparison.last_ns = 1, now * BLOCK_NS
+    compared = Compared(place, LoopSettings(), 60.0, ErrorBlocks())
+    compared.judge()
+    assert place.verdict.verdict == "better" and compared.is_better((takes_over + 13) * BLOCK_NS)
+    assert place.verdict.hours == pytest.approx((now - right_from) / 2.0, abs=0.1)

@@ -153,7 +153,7 @@ def test_of_several_none_refutes_a_right_model_more_often_than_a_single_one_may(
     """Likelihood ratios of a model that is right, at each of 1,000 looks; one in 200 may exceed 200."""
     trials, looks, step = 10_000, 1000, 0.2
     once = float(np.sqrt(2.0 * np.log(200.0)))
-    of_several = float(np.sqrt(once**2 + shared(4.0) ** 2 - 4.0**2))
+    of_several = float(np.sqrt(once**2 + shared(4.0, CANDIDATES) ** 2 - 4.0**2))
     rng, largest = np.random.default_rng(5), np.full((trials, CANDIDATES), -np.inf)
     log_l = np.zeros((trials, CANDIDATES))
     for _ in range(looks):

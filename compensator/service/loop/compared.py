@@ -38,10 +38,21 @@ class Compared:
         Length of a sample, s.
     present_error : ErrorBlocks
         Errors of the present model.
+    candidates : int
+        Number of candidates in shadow: they share the chance to be found better by accident.
     """
 
-    def __init__(self, place: Place, settings: LoopSettings, period_s: float, present_error: ErrorBlocks) -> None:
+    def __init__(
+        self,
+        place: Place,
+        settings: LoopSettings,
+        period_s: float,
+        present_error: ErrorBlocks,
+        *,
+        candidates: int = 1,
+    ) -> None:
         self._place, self._settings, self._present_error = place, settings, present_error
+        self._candidates = candidates
         self._period_s, self._comparison = period_s, Comparison(period_s, place.comparison)
 
     @property
@@ -68,11 +79,18 @@ class Compared:
         return True
 
     def judge(self) -> None:
-        """Make the verdict anew. Candidates share the chance to be found better by accident."""
-        wanted = self._settings.deviations
-        self._place.verdict = self._comparison.verdict(
-            deviations=shared(wanted) if self._place.role == "candidate" else wanted
-        )
+        """Make the verdict anew.
+
+        One that has taken over is judged by all values or by its own alone, whichever show more: it is no worse off
+        than beside the one before. These are two cases.
+        """
+        place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
+        cases = self._candidates + has_taken_over if place.role == "candidate" else 1
+        wanted = shared(self._settings.deviations, cases)
+        place.verdict = self._comparison.verdict(deviations=wanted)
+        if has_taken_over:
+            own = self._comparison.of_itself().verdict(deviations=wanted)
+            place.verdict = own if (own.deviations or 0.0) > place.shows else place.verdict
 
     def add_suspected(self, other: Outcome) -> bool:
         """Begin anew, and return whether something was compared: the sensor was wrong before it was suspected."""

@@ -88,7 +88,8 @@ class Loop:
 
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
-        return Compared(place, self._settings, self._period_s, self.state.error)
+        count = max(len(self.state.candidates), 1)
+        return Compared(place, self._settings, self._period_s, self.state.error, candidates=count)
 
     # ------------------------------------------------------------------ one sample
 

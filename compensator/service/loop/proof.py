@@ -15,25 +15,24 @@ BETTER_PART = 0.95
 #: sensor: a level of its own that is as wrong as the present one's gives a few percent by chance. Probes correct both.
 LEVEL_PART = 0.8
 #: What diagnoses have found runs in so many places at once. The diagnoses of simulated weeks name two or three
-#: explanations by turns; each costs processor time, and evidence of the others (`shared`).
+#: explanations by turns; each costs processor time, and what the others must show (`shared`).
 CANDIDATES = 3
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
-def shared(deviations: float) -> float:
-    """Return by how many standard deviations one of several candidates must refute the present model.
+def shared(deviations: float, candidates: int) -> float:
+    """Return by how many standard deviations one of so many candidates in shadow must refute the present model.
 
-    If that is right, the likelihood ratio L of each has the expectation 1, and so has the mean of `CANDIDATES` of them,
-    whatever they have in common: the mean ever exceeds e^(deviations² / 2) as rarely as L of a single candidate does
-    (`evidence`). One of them then exceeds `CANDIDATES` times that. A candidate in a place that has become free is
-    another case, as the next candidate of a single place is.
+    If that is right, the likelihood ratio L of each has the expectation 1, and so has the mean of all, whatever they
+    have in common: the mean ever exceeds e^(deviations² / 2) as rarely as L of a single candidate does (`evidence`).
+    Before that no L exceeds their number times as much. One that is alone again shares with none.
 
     Examples
     --------
-    >>> round(shared(4.0), 2)
-    4.27
+    >>> [round(shared(4.0, candidates), 2) for candidates in (1, 2, 3)]
+    [4.0, 4.17, 4.27]
     """
-    return math.sqrt(deviations**2 + 2.0 * math.log(CANDIDATES))
+    return math.sqrt(deviations**2 + 2.0 * math.log(candidates))
 
 
 def is_enough(found: ComparisonData, settings: LoopSettings, *, judged_h: float, compared_h: float) -> bool:

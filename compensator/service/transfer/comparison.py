@@ -121,7 +121,7 @@ class Comparison:
 
     def __init__(self, period_s: float, state: ComparisonState | None = None, *, axis: str = FIRST) -> None:
         self._fewest = _MEASURED * BLOCK_MIN * 60.0 / period_s
-        self._axis = axis
+        self._period_s, self._axis = period_s, axis
         self.state = state if state is not None else ComparisonState()
 
     def add(self, present: Outcome, candidate: Outcome, *, suspected: bool) -> bool:
@@ -206,14 +206,21 @@ class Comparison:
         hours = (self.state.last_ns - self.state.first_ns) / (3600 * NS)
         return changed(chosen, hours=hours)
 
+    def of_itself(self) -> Comparison:
+        """Return what was compared since the other model has been, without the one before it."""
+        state = self.state
+        blocks = [block for block in state.blocks if block.number * BLOCK_NS >= state.model_ns]
+        probes = [probe for probe in state.probes if probe.time_utc_ns >= state.model_ns]
+        own = msgspec.structs.replace(state, blocks=blocks, probes=probes, first_ns=max(state.first_ns, state.model_ns))
+        return Comparison(self._period_s, own, axis=self._axis)
+
     def is_itself_better(self) -> bool:
         """Return whether the other model is the better one since it has been compared, however clearly."""
-        blocks = [block for block in self.state.blocks if block.number * BLOCK_NS >= self.state.model_ns]
-        own, other, _ = _changes(blocks)
-        if own.size < FEWEST:
-            probes = [probe for probe in self.state.probes if probe.time_utc_ns >= self.state.model_ns]
-            own, other = np.array([(probe.own_um, probe.other_um) for probe in probes]).reshape(-1, 2).T
-        return own.size >= FEWEST and evidence(own, own - other).likelihood > 0.0
+        own = self.of_itself().state
+        values, other, _ = _changes(own.blocks)
+        if values.size < FEWEST:
+            values, other = np.array([(probe.own_um, probe.other_um) for probe in own.probes]).reshape(-1, 2).T
+        return values.size >= FEWEST and evidence(values, values - other).likelihood > 0.0
 
     # ------------------------------------------------------------------ blocks
 
