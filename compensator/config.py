@@ -190,7 +190,8 @@ class Loop(_Table, frozen=True, kw_only=True):
     after measured and predicted Y have diverged for so long, and again each time this has lasted twice as long.
     `record_h`: how much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the
     present model, on data after the diagnosis: hours of measured Y or the number of probes, and by how many
-    standard deviations the present model is refuted (by half as many the candidate is the better one).
+    standard deviations the present model is refuted (by half as many the candidate is the better one), by any of those
+    that run at once.
     `watch_h`: how long the model before is compared after an adoption, and a candidate at most.
     `memory_mb`, `time_limit_min`: limits of a diagnosis.
     """

@@ -204,6 +204,8 @@ class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
         Effects of the model before the last adoption, where it runs beside a candidate.
     before_text : str
         How it compares, in words.
+    others : list of str
+        The other candidates, each with its effects and how it compares, in words.
     """
 
     phase: Literal["idle", "shadow", "proposed", "watching"]
@@ -222,6 +224,7 @@ class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
     adopted_utc_ns: int
     before_effects: list[str] | None = None
     before_text: str = ""
+    others: list[str] = []
 
 
 class Status(Message, frozen=True, kw_only=True):

@@ -81,7 +81,7 @@ class MachineHistory:
             point["candidate_um"] = status.loop.y_pred_um
 
     def add_recorded_candidate(self, message: Candidate) -> None:
-        """Add a recorded prediction of a model in shadow: of two that of the candidate, as a status has it."""
+        """Add a recorded prediction of a model in shadow: of several the last candidate, as a status has it."""
         point = self._points.get(message.time_utc_ns // STEP_NS)
         if point is None or point["seq"] != message.seq:
             return

@@ -165,6 +165,8 @@ def loop_text(loop: Mapping[str, Any]) -> str:
     if loop.get("before_effects") is not None:
         before = ", ".join(loop["before_effects"]) or "no added effect"
         text += f" The one before the last change ({before}) goes on, too: {loop['before_text']}."
+    if loop.get("others"):
+        text += f" Compared, too: {'. '.join(loop['others'])}."
     return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text
 
 

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from compensator.service.loop import found
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.newcomer import Newcomer
 from compensator.service.loop.shadow import Shadow
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import extended, shown, stronger
-from tests.service.test_loop_contested import Early
 from tests.service.test_loop_service import Asked, Looping, checked
+from tests.service.test_loop_several import Early
 from tests.service.test_restart import QUILL
 
 
 class Breaks:
     """Stands in for a method: raises the first time that it is called, or each time."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: type, name: str, *, always: bool = False) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, *, always: bool = False) -> None:
         self.calls = 0
         works = getattr(owner, name)
 
@@ -51,10 +52,10 @@ def said(machine: Looping) -> str:
 
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(Loop, "receive"), (Loop, "prefer"), (ModelLoop, "begin_shadow"), (Newcomer, "update"), (Loop, "shadow_begins")],
+    [(Loop, "receive"), (Loop, "begin"), (ModelLoop, "begin_shadow"), (found, "warm_up"), (Loop, "shadow_begins")],
 )
 async def test_between_two_samples_and_in_a_warm_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str
 ) -> None:
     machine = Looping(tmp_path, shown(extended()))
     broken = Breaks(monkeypatch, owner, name)
@@ -81,9 +82,9 @@ async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
 ) -> None:
     machine = Early(tmp_path, shown(extended()), shown(stronger(0.1)), acts=lambda i: 0.5)
     await machine.run(480)
-    broken = Breaks(monkeypatch, Newcomer, "update")
-    await machine.run(600, until=lambda _: bool(broken.calls))
-    await machine.run(60)
+    broken = Breaks(monkeypatch, found, "warm_up")
+    later = itertools.count()
+    await machine.run(600, until=lambda _: bool(broken.calls) and next(later) == 60)
     assert "in the warm-up of the candidate" in said(machine)
     assert machine.candidates()[-1].model_sha256 == sha256_of(extended())
     unharmed(machine, len(machine.outcomes))

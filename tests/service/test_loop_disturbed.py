@@ -14,7 +14,7 @@ from compensator.errors import CompensatorError, ServiceError
 from compensator.messages import Sample
 from compensator.service.compensation import Compensation
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
-from compensator.service.loop.core import LOOP_STATE, SHADOW_FILES, ModelLoop
+from compensator.service.loop.core import LOOP_STATE, ModelLoop, shadow_files
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.schedule import begin_if_due, pass_planned
 from compensator.service.loop.state import LoopState
@@ -78,15 +78,15 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
     core = loop._core
     whole = core.attachments()
     present = Compensation(settings(), core.present)
-    assert ModelLoop(settings(), present.model, whole).shadows.keys() == {"found"}
-    model, state = SHADOW_FILES["found"]
+    assert ModelLoop(settings(), present.model, whole).shadows.keys() == {sha256_of(extended())}
+    model, state = shadow_files(core.state)[sha256_of(extended())]
     for damaged in (
         {name: data for name, data in whole.items() if name != model},
         whole | {model: whole[model][:200]},
         whole | {model: extended(2.0)},
         whole | {state: whole[state][:-20]},
         whole | {LOOP_STATE: whole[LOOP_STATE][:-20]},
-        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":1', b'{"schema":2')},
+        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":2', b'{"schema":1')},
     ):
         with pytest.raises(CompensatorError):
             ModelLoop(settings(), present.model, damaged)

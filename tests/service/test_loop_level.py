@@ -13,10 +13,15 @@ import pytest
 
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
+from compensator.config import Loop
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
+from compensator.service.loop.compared import Compared
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
+from compensator.service.loop.state import Place
 from compensator.service.replay import opening_of
+from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, crept, decisions, errors, extended, machine, run, settings, shown
@@ -143,3 +148,31 @@ def test_a_replay_sees_a_level_that_was_changed(adopted):
             if whole and records:
                 check.check(records)
     assert result.difference is not None and result.difference.topic == "estimate"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "goes_on"),
+    [
+        (lambda n: 6.0, lambda n: 6.3, True),
+        (lambda n: 6.0, lambda n: 0.5 * n, False),
+        (lambda n: 0.5 * n, lambda n: 6.0, False),  # it knew these hours, and may explain a mount that creeps
+    ],
+)
+def test_what_was_shown_of_the_level_goes_on_with_other_parameters_that_leave_a_constant_too(first, second, goes_on):
+    begins, since, now, until = 12, 20, 32, 41
+
+    def errors_of(left):
+        return ErrorBlocks(blocks=[(n, 1.0 * (n % 2) if n < begins else left(n)) for n in range(now)])
+
+    present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in range(until)])
+    before, after = (
+        Place(sha256=sha, effects=["delay:DTF"], role="candidate", since_utc_ns=at * BLOCK_NS, error=errors_of(left))
+        for sha, at, left in (("a", since, first), ("b", now, second))
+    )
+    compared = Compared(after, Loop(), 60.0, present)
+    compared.go_on_with(before, now * BLOCK_NS)
+    assert after.level_utc_ns == (since * BLOCK_NS if goes_on else 0)
+    assert compared.shown_level_um == (6.3 if goes_on else None)
+    # Else it must stay in hours of its own.
+    after.error.blocks += [(n, 6.3) for n in range(now, until)]
+    assert compared.shown_level_um == 6.3

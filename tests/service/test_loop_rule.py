@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.service.loop.compared import Compared
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
-from compensator.service.transfer.comparison import SURE_PART
+from compensator.service.loop.state import Place
+from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
@@ -67,14 +72,36 @@ def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
-def test_a_candidate_gives_its_place_to_other_effects_of_a_later_diagnosis_if_nothing_can_be_compared() -> None:
+def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_shown_stays_theirs() -> None:
     loop, now_ns = watching(ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED))
     running = loop.state.diagnosis
     loop.shadow_begins("c" * 64, ["delay:DTF"], now_ns - HOUR_NS)
     loop.state.diagnosis = running
-    assert loop.state.found is not None
-    loop.state.found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
-    assert follows(loop, now_ns) == ("shadow", "replaced")
+    (first,) = loop.state.found
+    shown = first.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=2.5, ratio=0.8)
+    assert follows(loop, now_ns) == ("shadow", "")
     loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-    # What other effects have shown does not count for it.
-    assert loop.state.found.sha256 == "b" * 64 and loop.state.found.verdict.verdict == "not_judged"
+    assert [(place.sha256[0], place.verdict.verdict) for place in loop.state.found] == [
+        ("c", "alike"),
+        ("b", "not_judged"),
+    ]
+    assert loop.state.found[0].verdict == shown and loop.state.candidate is first
+
+
+@pytest.mark.parametrize("right_from", [0, 40])
+def test_newer_parameters_are_judged_by_all_hours_or_by_their_own_whichever_show_more(right_from: int) -> None:
+    """The effect acts all the time, or from the beginning of their own hours on."""
+    takes_over, now = 40, 56
+    rng = np.random.default_rng(8)
+    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
+    for n in range(now):
+        moves, error = 2.0 * float(rng.normal()), 0.3 * float(rng.normal())
+        own, other = (moves + error, error) if n >= right_from else (error, error - moves)
+        zero = int(n >= takes_over)
+        place.comparison.blocks.append(Block(zero, n, 30, (30 * own**2, 30 * other**2), (own, other, moves)))
+    place.comparison.zeros, place.comparison.model_ns = 1, takes_over * BLOCK_NS
+    place.comparison.first_ns, place.comparison.last_ns = 1, now * BLOCK_NS
+    compared = Compared(place, LoopSettings(), 60.0, ErrorBlocks())
+    compared.judge()
+    assert place.verdict.verdict == "better" and compared.is_better((takes_over + 13) * BLOCK_NS)
+    assert place.verdict.hours == pytest.approx((now - right_from) / 2.0, abs=0.1)

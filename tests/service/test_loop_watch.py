@@ -23,6 +23,7 @@ from compensator.model.model_file import parse_model
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
 from compensator.service.loop import live
+from compensator.service.loop.choice import Choice
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
@@ -74,9 +75,13 @@ def test_the_way_back_stays_open_whatever_is_found_meanwhile(change: float) -> N
     assert roles == [{"before", "candidate"}] and back - ended[0] < DAY // 2
     assert [step for seq, step, _ in found if seq < back].count("shadow") >= 1
     assert loop.effects == () and "adopt" not in [step for _, step, _ in found]
-    # What was found goes on beside the model that is in force now, and what it has shown begins anew.
-    after = [one for step in steps if step.outcome.sample.seq == back + 1 for one in step.candidates]
-    assert [(one.role, one.hours, one.verdict) for one in after] == [("candidate", 0.0, "not_judged")]
+    # What was found goes on beside the model that is in force now, and the hours of both count.
+    before, after = (
+        [one for step in steps if step.outcome.sample.seq == at for one in step.candidates][-1]
+        for at in (back, back + 1)
+    )
+    assert after.role == "candidate" and before.hours - 1.0 <= after.hours <= before.hours
+    assert after.present_rms_um != before.present_rms_um
 
 
 def test_other_parameters_are_adopted_and_the_model_before_both_stays_the_way_back() -> None:
@@ -116,9 +121,10 @@ def test_a_couple_that_drifts_while_both_are_compared_judges_neither_and_changes
     began.append(steps[-1].outcome.sample.seq)
     steps += run(loop, source, 500)
     assert any(sensor_suspected(step.outcome.offset.reasons) for step in steps)
-    for role in ("before", "candidate"):
-        hours = [one.hours for step in steps for one in step.candidates if one.role == role]
-        assert max(hours) > 0.0 == hours[-1]  # what was compared until it was suspected is forgotten
+    hours = [one.hours for step in steps for one in step.candidates if one.role == "before"]
+    assert max(hours) > 0.0 == hours[-1]  # what was compared until it was suspected is forgotten
+    last = [step.outcome.sample.seq for step in steps if len(step.candidates) == 2][-1]
+    assert last == steps[-1].outcome.sample.seq or (last, "end", "worse") in decisions(steps)
     assert not {"adopt", "back"} & {step for _, step, _ in decisions(steps)}
     assert loop.effects == ("input:coolant_degc",)
 
@@ -152,13 +158,10 @@ def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 
 
 
 def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
-    """Return what follows from a diagnosis that has found another effect, or the same with other parameters.
-
-    Nothing of it can be compared on the record.
-    """
+    """Return what follows from a diagnosis that has found another effect, or the same with other parameters."""
     found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
     found = replace(found, same_effects=same, change_deviations=9.0 if same else None)
-    (note,) = loop.receive(found, now_ns) or loop.prefer(judged(NOT_JUDGED))
+    (note,) = loop.receive(found, now_ns) or loop.begin()
     return note.data["step"], note.data.get("why", "")
 
 
@@ -179,7 +182,7 @@ def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData,
     loop, now_ns = watching(verdict, hours=1.0)
     assert follows(loop, now_ns, same=same) == ("shadow", "")
     loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-    assert {name: place.sha256[0] for name, place in loop.state.taken.items()} == {"watched": "a", "found": "b"}
+    assert [place.sha256[0] for place in loop.state.taken] == ["a", "b"]
     assert loop.state.watched is not None and loop.state.watched.verdict == verdict
     assert loop.state.phase == "shadow"
 
@@ -196,24 +199,25 @@ def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() ->
     for verdict, may in ((judged(ALIKE, 2.5, 0.8), False), (judged(ALIKE, 0.5, 1.0), True)):
         loop, now_ns = watching(verdict)
         loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-        assert loop.state.found is not None
-        loop.state.found.verdict = better
-        assert loop._may_adopt(loop.state.found, now_ns) == may
+        (found,) = loop.state.found
+        found.verdict = better
+        choice = Choice(loop.state, LoopSettings(policy="adopt"), loop.compared)
+        assert choice.adopted([found], now_ns) is (found if may else None)
 
 
 def test_a_candidate_neither_replaces_a_decided_exchange_nor_outlives_it() -> None:
     loop, now_ns = watching(judged(WORSE, -9.0, 3.0))
-    loop.state.exchange, loop.state.incoming = "back", "watched"
+    loop.state.exchange, loop.state.incoming = "back", "a" * 64
     assert follows(loop, now_ns) == ("nothing", "waits")
     for sha256 in ("c" * 64, ""):
         loop, now_ns = watching(judged(WORSE, -9.0, 3.0))
         loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-        loop.state.exchange, loop.state.incoming = "adopt", "found"
+        loop.state.exchange, loop.state.incoming = "adopt", "b" * 64
         running = loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=1, why="planned", candidate_sha256=sha256)
-        assert loop.exchanged(now_ns, "d" * 64) == "watched"
+        assert loop.exchanged(now_ns, "d" * 64)
         assert loop.state.diagnosis == (None if sha256 else running)
         assert loop.state.phase == "watching" and loop.state.watched is not None
-        assert loop.state.watched.sha256 == "d" * 64 and loop.state.found is None
+        assert loop.state.watched.sha256 == "d" * 64 and loop.state.found == []
 
 
 def test_after_a_way_back_what_is_avoided_or_in_force_is_compared_no_longer() -> None:
@@ -224,11 +228,9 @@ def test_after_a_way_back_what_is_avoided_or_in_force_is_compared_no_longer() ->
     ):
         loop, now_ns = watching(judged(ComparisonVerdict.BETTER, 9.0, 0.3))
         loop.shadow_begins(sha256, effects, now_ns, role="candidate" if effects else "before")
-        loop.state.exchange, loop.state.incoming = "back", "watched"
-        assert loop.exchanged(now_ns + HOUR_NS, "d" * 64) is None
-        assert loop.state.watched is None and (loop.state.found is not None) == stays
-        if loop.state.found is not None:
-            assert loop.state.found.since_utc_ns == now_ns + HOUR_NS
+        loop.state.exchange, loop.state.incoming = "back", "a" * 64
+        assert not loop.exchanged(now_ns + HOUR_NS, "d" * 64)
+        assert loop.state.watched is None and bool(loop.state.found) == stays
 
 
 async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_the_same_of_both(tmp_path: Path) -> None:
@@ -296,8 +298,8 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
         before.process(one)
     core = ModelLoop(config, present.model, {})
     core.state.watched = Place(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
-    core.state.exchange, core.state.incoming = "back", "watched"
-    core.shadows["watched"] = Shadow(before, QUILL)
+    core.state.exchange, core.state.incoming = "back", sha256_of(QUILL)
+    core.shadows[sha256_of(QUILL)] = Shadow(before, QUILL)
     store = ModelStore(tmp_path, QUILL)
     store.adopt(extended(), name="extended", time_utc_ns=1, by_loop=True)
     events, files = Mock(), Mock()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
-from compensator.events import EventKind
+from compensator.events import ComparisonData, EventKind
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
@@ -14,11 +14,12 @@ from compensator.service.loop.proof import (
     is_better_about_zero,
     is_clearly_better,
     is_enough,
+    shared,
 )
 from compensator.service.loop.state import Place
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome
-from compensator.service.transfer.comparison import Comparison
+from compensator.service.transfer.comparison import Comparison, beside
 from compensator.service.transfer.second_opinion import is_unusable
 
 _HOUR_NS = 3600 * NS
@@ -37,11 +38,22 @@ class Compared:
         Length of a sample, s.
     present_error : ErrorBlocks
         Errors of the present model.
+    candidates : int
+        Number of candidates in shadow: they share the chance to be found better by accident.
     """
 
-    def __init__(self, place: Place, settings: LoopSettings, period_s: float, present_error: ErrorBlocks) -> None:
+    def __init__(
+        self,
+        place: Place,
+        settings: LoopSettings,
+        period_s: float,
+        present_error: ErrorBlocks,
+        *,
+        candidates: int = 1,
+    ) -> None:
         self._place, self._settings, self._present_error = place, settings, present_error
-        self._comparison = Comparison(period_s, place.comparison)
+        self._candidates = candidates
+        self._period_s, self._comparison = period_s, Comparison(period_s, place.comparison)
 
     @property
     def judged_h(self) -> float:
@@ -63,8 +75,22 @@ class Compared:
         hours = remembered_h(self._settings, self._place.role)
         oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
         found.forget_before(oldest_ns, 2 * self._settings.probes)
-        self._place.verdict = found.verdict(deviations=self._settings.deviations)
+        self.judge()
         return True
+
+    def judge(self) -> None:
+        """Make the verdict anew.
+
+        One that has taken over is judged by all values or by its own alone, whichever show more: it is no worse off
+        than beside the one before. These are two cases.
+        """
+        place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
+        cases = self._candidates + has_taken_over if place.role == "candidate" else 1
+        wanted = shared(self._settings.deviations, cases)
+        place.verdict = self._comparison.verdict(deviations=wanted)
+        if has_taken_over:
+            own = self._comparison.of_itself().verdict(deviations=wanted)
+            place.verdict = own if (own.deviations or 0.0) > place.shows else place.verdict
 
     def add_suspected(self, other: Outcome) -> bool:
         """Begin anew, and return whether something was compared: the sensor was wrong before it was suspected."""
@@ -86,8 +112,39 @@ class Compared:
     @property
     def shown_level_um(self) -> float | None:
         """The level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
-        since_ns = self._place.since_utc_ns
+        since_ns = self._place.level_utc_ns or self._place.since_utc_ns
         return level_um(self._present_error.blocks, self._place.error.blocks, since_ns=since_ns)
+
+    def go_on_with(self, before: Place, now_ns: int) -> None:
+        """Take over what a candidate with the same effects has shown.
+
+        Also of its level: hours that it did not know have shown it, and if the errors of this one stay in them, too,
+        the two predictions differ by a constant, so they show the level of both. Where only one of them stays, or
+        neither, the level is judged anew.
+        """
+        place, shown = self._place, Compared(before, self._settings, self._period_s, self._present_error)
+        place.comparison, place.verdict = before.comparison, before.verdict
+        self._comparison = Comparison(self._period_s, place.comparison)
+        self._comparison.go_on_with(now_ns)
+        place.level_utc_ns = before.level_utc_ns or before.since_utc_ns
+        if shown.shown_level_um is None or self.shown_level_um is None:
+            place.level_utc_ns = 0
+
+    def beside(self, rival: Place) -> ComparisonData:
+        """Compare the model with another one in shadow, as if that were the present one, on the hours of both."""
+        state = beside(rival.comparison, self._place.comparison)
+        return Comparison(self._period_s, state).verdict(deviations=self._settings.deviations)
+
+    def go_on_beside(self, present: Place, level_um: float) -> None:
+        """Go on after another model in shadow, raised by so much, has become the present one: the hours of both count.
+
+        Nothing is proposed any longer.
+        """
+        place = self._place
+        place.is_proposed, place.level_utc_ns = False, 0
+        place.comparison = beside(present.comparison, place.comparison, level_um=level_um)
+        self._comparison = Comparison(self._period_s, place.comparison)
+        self.judge()
 
     @property
     def level_um(self) -> float | None:
@@ -107,3 +164,9 @@ class Compared:
     def unknown_level_um(self) -> float:
         """By how much it is raised where its level is not known, µm: only its changes are new."""
         return self._comparison.level_um if self._place.verdict.y_moved else 0.0
+
+    @property
+    def level_at_adoption_um(self) -> float:
+        """By how much it is raised if it is adopted now, whoever decides it, µm."""
+        known_um = self.level_um
+        return known_um if known_um is not None else self.unknown_level_um

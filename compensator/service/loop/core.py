@@ -16,21 +16,33 @@ from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
 from compensator.messages import Candidate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.newcomer import Newcomer
-from compensator.service.loop.place import rival_of
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
-from compensator.service.loop.state import LoopState, PlaceName, decode_loop
+from compensator.service.loop.state import LoopState, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
 from compensator.service.status import Handover, Zero
 from compensator.service.transfer.second_opinion import described
 
-#: Attachments of a recording: state of the loop, and model file and state of each shadow, by place.
+#: Attachment of a recording: state of the loop.
 LOOP_STATE = "loop.json"
-SHADOW_FILES: Mapping[PlaceName, tuple[str, str]] = {
-    "found": ("candidate.toml", "candidate_state.json"),
-    "watched": ("before.toml", "before_state.json"),
-}
+
+
+def shadow_files(state: LoopState) -> dict[str, tuple[str, str]]:
+    """Return the attachments of each model in shadow, by its hash: model file and state.
+
+    Examples
+    --------
+    >>> from compensator.service.loop.state import Place
+    >>> places = [Place(sha256=sha, effects=[], role="candidate", since_utc_ns=1) for sha in "ab"]
+    >>> list(shadow_files(LoopState(found=places)).values())
+    [('candidate.toml', 'candidate_state.json'), ('candidate_2.toml', 'candidate_2_state.json')]
+    """
+    names = ["before"] if state.watched is not None else []
+    names += [f"candidate_{number}" if number > 1 else "candidate" for number in range(1, len(state.found) + 1)]
+    return {
+        place.sha256: (f"{name}.toml", f"{name}_state.json") for place, name in zip(state.taken, names, strict=True)
+    }
 
 
 class Followed(msgspec.Struct, frozen=True):
@@ -67,13 +79,12 @@ class ModelLoop:
         data = attachments.get(LOOP_STATE)
         state = decode_loop(data) if data is not None else None
         self.loop = Loop(config.loop, present.period_s, effect_names(present), state)
-        #: The models in shadow, by place; one without a place has ended, and goes before the next sample.
-        self.shadows: dict[PlaceName, Shadow] = {}
-        for name in self.state.taken:
-            files = SHADOW_FILES[name]
+        #: The models in shadow, by hash; one without a place has ended, and goes before the next sample.
+        self.shadows: dict[str, Shadow] = {}
+        for sha256, files in shadow_files(self.state).items():
             if not attachments.keys() >= set(files):
                 raise DataError(f"loop.json names a model in shadow, but {' or '.join(files)} is missing")
-            self.shadows[name] = Shadow.of(config, *(attachments[file] for file in files))
+            self.shadows[sha256] = Shadow.of(config, *(attachments[file] for file in files))
 
     @property
     def state(self) -> LoopState:
@@ -88,9 +99,9 @@ class ModelLoop:
     def attachments(self) -> dict[str, bytes]:
         """Return what a recording must begin with."""
         found = {LOOP_STATE: msgspec.json.encode(self.state)}
-        for name in self.state.taken:
-            shadow = self.shadows[name]
-            found |= zip(SHADOW_FILES[name], (shadow.data, shadow.compensation.state()), strict=True)
+        for sha256, files in shadow_files(self.state).items():
+            shadow = self.shadows[sha256]
+            found |= zip(files, (shadow.data, shadow.compensation.state()), strict=True)
         return found
 
     # ------------------------------------------------------------------ one sample
@@ -100,20 +111,22 @@ class ModelLoop:
         places = self.state.taken
         if not places:
             return Followed((), tuple(self.loop.step(outcome, {})))
-        present, others = outcome, dict[PlaceName, Outcome]()
-        for name in places:
-            present, others[name] = self.shadows[name].process(outcome)
+        present, others = outcome, dict[str, Outcome]()
+        for place in places:
+            present, others[place.sha256] = self.shadows[place.sha256].process(outcome)
         notes = self.loop.step(present, others)
+        # What a status shows comes last.
+        shown = self.state.shown
         messages = tuple(
             candidate_message(
                 present,
-                others[name],
+                others[place.sha256],
                 place.role,
                 place.verdict,
-                self.loop.judged_h(place),
+                self.loop.compared(place).judged_h,
                 len(place.comparison.probes),
             )
-            for name, place in places.items()
+            for place in sorted(places, key=lambda place: place is shown)
         )
         return Followed(messages, tuple(notes))
 
@@ -131,7 +144,7 @@ class ModelLoop:
 
     def weigh(self, found: Diagnosed, *, calibrated: bytes) -> Weighed:
         """Return what follows from a diagnosis; `receive` decides by it."""
-        in_shadow = [place.sha256 for place in self.state.taken.values()]
+        in_shadow = [place.sha256 for place in self.state.taken]
         weighed = weigh(found, self._config, calibrated=calibrated, present=self.present, in_shadow=in_shadow)
         return self._of_its_time(weighed)
 
@@ -150,34 +163,29 @@ class ModelLoop:
         """Decide what follows from a diagnosis."""
         return self.loop.receive(found, now_ns)
 
-    def prefer(self, newcomer: Newcomer) -> list[Note]:
-        """Decide whether what a diagnosis has found gets its place, once it is warmed up."""
-        settings = self._config.loop
-        assert settings is not None
-        rival = rival_of(self.state, settings)
-        return self.loop.prefer(newcomer.beside(rival, settings) if rival is not None else None)
-
     @property
     def is_free(self) -> bool:
         """Whether what is warmed up gets its place now."""
         return self.state.has_next and not self.state.exchange
 
     def begin_shadow(
-        self, compensation: Compensation, data: bytes, now_ns: int, role: Role, newcomer: Newcomer
+        self, compensation: Compensation, data: bytes, now_ns: int, role: Role, error: ErrorBlocks
     ) -> None:
         """Begin to compare what a diagnosis has found, in its state after the last sample."""
         model = compensation.model
-        self.shadows["found"] = Shadow(compensation, data)
-        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=newcomer.error)
+        self.shadows[model.sha256] = Shadow(compensation, data)
+        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
+        self.drop_ended()
 
     def offset_change_um(self, present: Compensation) -> float | None:
         """Return by how much the offset would move if the candidate was adopted now, µm; None if that is unknown."""
-        shadow, candidate = self.shadows.get("found"), self.state.candidate
-        if shadow is None or candidate is None:
+        candidate = self.state.candidate
+        if candidate is None:
             return None
+        shadow = self.shadows[candidate.sha256]
         new = Compensation(self._config, shadow.compensation.model)
         new.restore(shadow.compensation.state())
-        new.raise_level(self.loop.level_at_adoption_um(candidate))
+        new.raise_level(self.loop.compared(candidate).level_at_adoption_um)
         new.continue_from(_handed_over(present))
         difference = new.status.target_um - present.status.target_um
         return difference if math.isfinite(difference) else None
@@ -206,21 +214,21 @@ class ModelLoop:
         handover = present.status.handover
         new.compensation.raise_level(level_um)
         new.compensation.continue_from(_handed_over(present))
-        outgoing = self.loop.exchanged(now_ns, present.model.sha256)
+        goes_on = self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
         # What holds the published offset concerns the new one only.
         present.continue_from(replace_fields(handover, operator_hold=False, internal_error=False, probing=None))
-        if outgoing is not None:
-            self.shadows[outgoing] = Shadow(present, data)
+        if goes_on:
+            self.shadows[present.model.sha256] = Shadow(present, data)
         self.drop_ended()
         note = _exchange_note(action, present, new.compensation, verdict, level_um)
         return new.compensation, new.data, note
 
     def drop_ended(self) -> bool:
         """Let go of what is in shadow no longer; return whether there was something."""
-        ended = self.shadows.keys() - self.state.taken.keys()
-        for name in ended:
-            del self.shadows[name]
+        ended = self.shadows.keys() - {place.sha256 for place in self.state.taken}
+        for sha256 in ended:
+            del self.shadows[sha256]
         return bool(ended)
 
 
@@ -256,7 +264,7 @@ def warmed_on(
     model: ThermalModel,
     record: Sequence[Outcome],
     at_rest: Outcome | None = None,
-    newcomer: Newcomer | None = None,
+    error: ErrorBlocks | None = None,
 ) -> Compensation:
     """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
 
@@ -268,8 +276,8 @@ def warmed_on(
         Outcomes in order; what is missing between two of them is a pause.
     at_rest : Outcome, optional
         That of the last zero at rest before the record.
-    newcomer : Newcomer, optional
-        Gets its outcomes.
+    error : ErrorBlocks, optional
+        Gets its errors.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
@@ -287,8 +295,8 @@ def warmed_on(
             apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
             compensation.pause(round(apart) - 1)
         _, other = shadow.process(outcome)
-        if newcomer is not None:
-            newcomer.update(other)
+        if error is not None:
+            error.update(other)
         last = outcome
     return compensation
 

@@ -12,7 +12,7 @@ from compensator.config import Config
 from compensator.errors import CompensatorError
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop
-from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.weighing import Weighed
@@ -25,7 +25,7 @@ log = logging.getLogger("compensator")
 
 @dataclass(slots=True)
 class Found:
-    """A diagnosis that has ended; and its candidate once it is warmed up, with what it shows on the record.
+    """A diagnosis that has ended; and its candidate once it is warmed up, with its errors on the record.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Found:
         The diagnosis, and what follows from it.
     text : str
         One sentence for people.
-    warmed : tuple of Compensation and Newcomer, optional
+    warmed : tuple of Compensation and ErrorBlocks, optional
         The candidate once it is warmed up.
     since : list of Outcome
         Live samples since the warm-up began.
@@ -43,18 +43,18 @@ class Found:
 
     weighed: Weighed
     text: str
-    warmed: tuple[Compensation, Newcomer] | None = None
+    warmed: tuple[Compensation, ErrorBlocks] | None = None
     since: list[Outcome] = field(default_factory=list)
     why: str = ""
 
     async def warm_up(self, recordings: Path, config: Config, data: bytes) -> None:
         """Warm the candidate up; `why` says why it cannot be."""
 
-        def warmed() -> tuple[Compensation, Newcomer]:
+        def warmed() -> tuple[Compensation, ErrorBlocks]:
             model = model_of(config, data, source="candidate")
-            newcomer = Newcomer(model.period_s)
-            ready = warm_up(recordings, config, model, between_samples=give_way(), probes=True, seen=newcomer.update)
-            return ready.compensation, newcomer
+            error = ErrorBlocks()
+            ready = warm_up(recordings, config, model, between_samples=give_way(), probes=True, seen=error.update)
+            return ready.compensation, error
 
         try:
             self.warmed = await asyncio.to_thread(warmed)
@@ -64,11 +64,11 @@ class Found:
             log.exception("internal error in a warm-up")
             self.why = _internal(error)
 
-    def catch_up(self) -> tuple[Compensation, Newcomer] | None:
+    def catch_up(self) -> tuple[Compensation, ErrorBlocks] | None:
         """Return the candidate in its state after the last sample; None if it is not warmed up, or cannot be used."""
         if self.warmed is None or self.why:
             return None
-        compensation, newcomer = self.warmed
+        compensation, errors = self.warmed
         shadow = Shadow(compensation, b"")
         try:
             for outcome in self.since:
@@ -77,14 +77,14 @@ class Found:
                     continue
                 if compensation.status.seq >= 0:
                     compensation.pause(missing)
-                newcomer.update(shadow.process(outcome)[1])
+                errors.update(shadow.process(outcome)[1])
         except Exception as error:
             # What runs in shadow already goes on.
             log.exception("internal error in a warm-up")
             self.why = _internal(error)
             return None
         self.since.clear()
-        return compensation, newcomer
+        return compensation, errors
 
 
 async def diagnosed(core: ModelLoop, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:

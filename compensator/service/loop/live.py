@@ -156,9 +156,9 @@ class LiveLoop:
             return
         self._warming = None
         assert warmed.weighed.candidate is not None
-        compensation, newcomer = ready
+        compensation, error = ready
         role, now_ns = role_of(warmed.weighed.data), compensation.status.time_utc_ns
-        core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, newcomer)
+        core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, error)
         self._journal.start_new_file()
 
     def hand_over(self, present: Compensation) -> None:
@@ -184,7 +184,7 @@ class LiveLoop:
         if warming.why:
             self._end_one(core, "", warming.why)
         elif ready is not None:
-            self._note(core.prefer(ready[1]))
+            self._note(core.loop.begin())
             if core.state.diagnosis is None:
                 self._warming = None  # it does not get the place
 

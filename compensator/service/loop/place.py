@@ -1,9 +1,8 @@
-"""Which of the two places beside the present model a model gets, and what follows from a diagnosis.
+"""Which models run in shadow beside the present one, and what follows from a diagnosis.
 
-What a diagnosis finds gives its place to what a later one finds, which knows more, but not to what is worse on the same
-hours (`newcomer`); a proposal is held more firmly.
-The model before an adoption has a place of its own for as long as it is watched: the way back does not depend on what
-is found meanwhile.
+What a diagnosis has found takes a free place; with the effects of a candidate it takes over what that one has shown.
+Where all places are taken the model that shows least gives way. The model before an adoption has a place of its own for
+as long as it is watched: the way back does not depend on what is found meanwhile.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from collections.abc import Sequence
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
-from compensator.service.loop.proof import BETTER_PART, is_clearly_better
+from compensator.service.loop.proof import BETTER_PART, CANDIDATES
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place, PlaceName
+from compensator.service.loop.state import LoopState, Place
 
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
@@ -55,21 +54,28 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
-    if state.candidate is not None and is_asked(state.candidate, settings):
-        return "in_shadow" if takes_over(state, role, found.effects) else "waits"
-    if takes_over(state, role, found.effects):
-        assert state.candidate is not None
+    before = with_effects(state, role, found.effects)
+    if before is not None:
         # What gave its place too often would never be compared for its own hours.
-        return "in_shadow" if now_ns - state.candidate.since_utc_ns < settings.shadow_h * _HOUR_NS else ""
+        is_young = now_ns - before.since_utc_ns < settings.shadow_h * _HOUR_NS
+        return "in_shadow" if is_young or is_asked(before, settings) else ""
     return "waits" if state.exchange else ""
 
 
-def takes_over(state: LoopState, role: Role, effects: Sequence[str]) -> bool:
-    """Return whether a candidate has the effects of the one in shadow: then the comparison goes on with it."""
-    candidate = state.candidate
-    if candidate is None or role != "candidate":
-        return False
-    return not state.exchange and sorted(candidate.effects) == sorted(effects)
+def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place | None:
+    """Return the candidate with the effects of another one, which then goes on with its comparison."""
+    alike = [place for place in state.candidates if sorted(place.effects) == sorted(effects)]
+    return alike[0] if alike and role == "candidate" and not state.exchange else None
+
+
+def gives_way(state: LoopState) -> Place | None:
+    """Return the model that gives its place to a newcomer with other effects: that shows least; None if one is free.
+
+    What is proposed stays.
+    """
+    if len(state.found) < CANDIDATES:
+        return None
+    return min((place for place in state.found if not place.is_proposed), key=lambda place: place.shows)
 
 
 def is_asked(candidate: Place, settings: LoopSettings) -> bool:
@@ -78,38 +84,6 @@ def is_asked(candidate: Place, settings: LoopSettings) -> bool:
     It must still be there at the answer: whatever is newer comes after it.
     """
     return candidate.is_proposed and settings.policy == "propose"
-
-
-def rival_of(state: LoopState, settings: LoopSettings) -> Place | None:
-    """Return the candidate beside which what a diagnosis has found must show itself; None if it just gets the place.
-
-    With the same effects it takes over what that one has shown, unless a person reads the proposal.
-    """
-    found, candidate = state.diagnosis.found if state.diagnosis is not None else None, state.candidate
-    if found is None or candidate is None:
-        return None
-    if takes_over(state, role_of(found), found.effects) and not is_asked(candidate, settings):
-        return None
-    return candidate
-
-
-def keeps_place(candidate: Place, beside: ComparisonData, settings: LoopSettings) -> bool:
-    """Return whether a candidate keeps its place against what is compared with it as the present model.
-
-    A proposed one gives it to what is clearly better, another one to all that is not clearly worse.
-    """
-    if candidate.is_proposed:
-        return is_asked(candidate, settings) or not is_clearly_better(beside)
-    return beside.verdict == ComparisonVerdict.WORSE
-
-
-def place_of_outgoing(state: LoopState, effects: Sequence[str], adopted: Sequence[str]) -> PlaceName:
-    """Return the place that the present model gets at an adoption.
-
-    Other parameters of the same effects end with the same effect: a model before them stays the one that is watched.
-    """
-    is_refined = state.watched is not None and sorted(effects) == sorted(adopted)
-    return "found" if is_refined else "watched"
 
 
 def falls(found: ComparisonData, settings: LoopSettings) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
@@ -12,7 +14,25 @@ BETTER_PART = 0.95
 #: A candidate whose level nothing else shows must be wrong by less than this part about the zero of a displacement
 #: sensor: a level of its own that is as wrong as the present one's gives a few percent by chance. Probes correct both.
 LEVEL_PART = 0.8
+#: What diagnoses have found runs in so many places at once. The diagnoses of simulated weeks name two or three
+#: explanations by turns; each costs processor time, and what the others must show (`shared`).
+CANDIDATES = 3
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
+
+
+def shared(deviations: float, candidates: int) -> float:
+    """Return by how many standard deviations one of so many candidates in shadow must refute the present model.
+
+    If that is right, the likelihood ratio L of each has the expectation 1, and so has the mean of all, whatever they
+    have in common: the mean ever exceeds e^(deviations² / 2) as rarely as L of a single candidate does (`evidence`).
+    Before that no L exceeds their number times as much. One that is alone again shares with none.
+
+    Examples
+    --------
+    >>> [round(shared(4.0, candidates), 2) for candidates in (1, 2, 3)]
+    [4.0, 4.17, 4.27]
+    """
+    return math.sqrt(deviations**2 + 2.0 * math.log(candidates))
 
 
 def is_enough(found: ComparisonData, settings: LoopSettings, *, judged_h: float, compared_h: float) -> bool:

@@ -10,7 +10,6 @@ from compensator.messages import Event
 from compensator.recording.container import Contents
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
-from compensator.service.loop.loop import BESIDE
 from compensator.service.replay import RecordedStep, setup_of
 
 #: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
@@ -74,10 +73,9 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
         return core.receive(found, now_ns) if found is not None else []
     elif event.kind == EventKind.LOOP:
         data = data_of(event, LoopData)
-        is_beside = data is not None and data.comparison is not None and data.why in BESIDE
-        if data is not None and (is_beside or data.step == LoopAction.SHADOW):
-            # When a warm-up ends, and how the newcomer compares with the candidate, are inputs, as a diagnosis is.
-            return core.loop.prefer(data.comparison)
+        if data is not None and data.step in (LoopAction.SHADOW, LoopAction.NOTHING):
+            # When a warm-up ends is an input, as a diagnosis is: what follows from it has not begun yet.
+            return core.loop.begin()
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
             core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
     return []

@@ -18,7 +18,7 @@ from compensator.events import EventKind, Note
 from compensator.messages import Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
-from compensator.service.loop.newcomer import Newcomer
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
 from compensator.service.probing import ReceivedProbe
@@ -209,11 +209,11 @@ class LoopRun:
             running = core.state.diagnosis
             if running is not None and weighed.candidate is not None:
                 model = model_of(self._config, weighed.candidate, source="candidate")
-                newcomer = Newcomer(model.period_s)
-                warmed = warmed_on(self._config, model, list(self._record), self._at_rest, newcomer)
-                notes += core.prefer(newcomer)
+                error = ErrorBlocks()
+                warmed = warmed_on(self._config, model, list(self._record), self._at_rest, error)
+                notes += core.loop.begin()
                 if core.is_free:
-                    core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data), newcomer)
+                    core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data), error)
         return notes
 
     def _exchange(self, now_ns: int) -> Note:

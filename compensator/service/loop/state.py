@@ -13,12 +13,10 @@ from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 1
+STATE_SCHEMA = 2
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
-#: The two places beside the present model: for what a diagnosis has found, and for the model before an adoption.
-PlaceName = Literal["found", "watched"]
 #: Before the first value.
 NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NO_Y)
 
@@ -51,6 +49,9 @@ class Place(msgspec.Struct, kw_only=True):
         Whether it may be adopted, or is a model that the service goes back to.
     since_utc_ns : int
         When the comparison began, ns since 1970 UTC.
+    level_utc_ns : int
+        Since when its level is judged, ns since 1970 UTC, where it goes on with what another one with the same effects
+        has shown of it; 0: since `since_utc_ns`.
     is_proposed : bool
         Whether a person was asked to adopt it.
     comparison : ComparisonState
@@ -65,6 +66,7 @@ class Place(msgspec.Struct, kw_only=True):
     effects: list[str]
     role: Role
     since_utc_ns: int
+    level_utc_ns: int = 0
     is_proposed: bool = False
     comparison: ComparisonState = msgspec.field(default_factory=ComparisonState)
     verdict: ComparisonData = NO_VERDICT
@@ -73,6 +75,11 @@ class Place(msgspec.Struct, kw_only=True):
     def begin_anew(self) -> None:
         """Forget what was compared."""
         self.comparison, self.verdict = ComparisonState(), NO_VERDICT
+
+    @property
+    def shows(self) -> float:
+        """How strongly measured Y speaks for it so far, standard deviations; 0 while there is too little."""
+        return self.verdict.deviations or 0.0
 
 
 class Avoided(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,8 +98,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         `STATE_SCHEMA`.
     exchange : {"", "adopt", "back"}
         An exchange that was decided and happens before the next sample.
-    incoming : {"found", "watched"}
-        The place from which a model replaces the present one.
+    incoming : str
+        Hash of the model in shadow that then replaces the present one.
     level_um : float
         By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
@@ -101,8 +108,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min, clean_min : float
         For how long the model, and for how long no sensor, has been suspected, min.
-    found : Place, optional
-        What a diagnosis has found: a candidate, or the calibrated model.
+    found : list of Place
+        What diagnoses have found: candidates, and the calibrated model.
     watched : Place, optional
         The model before the last adoption.
     adopted_utc_ns : int
@@ -117,46 +124,48 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
     schema: int = STATE_SCHEMA
     exchange: Exchange = ""
-    incoming: PlaceName = "found"
+    incoming: str = ""
     level_um: float = 0.0
     diagnosis: Running | None = None
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
     clean_min: float = 0.0
-    found: Place | None = None
+    found: list[Place] = []
     watched: Place | None = None
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     avoided: list[Avoided] = []
 
-    def place(self, name: PlaceName) -> Place | None:
-        """Return the model in a place."""
-        return self.found if name == "found" else self.watched
+    @property
+    def taken(self) -> list[Place]:
+        """The models in shadow, the way back first."""
+        return [*([self.watched] if self.watched is not None else []), *self.found]
 
-    def put(self, name: PlaceName, place: Place | None) -> None:
-        """Put a model in a place, or empty it."""
-        if name == "found":
-            self.found = place
-        else:
-            self.watched = place
+    def place(self, sha256: str) -> Place | None:
+        """Return the model in shadow with a hash."""
+        return next((place for place in self.taken if place.sha256 == sha256), None)
+
+    def remove(self, place: Place) -> None:
+        """Let a model go."""
+        self.watched = None if place is self.watched else self.watched
+        self.found = [one for one in self.found if one is not place]
 
     @property
-    def taken(self) -> dict[PlaceName, Place]:
-        """The places that are taken, the way back first."""
-        both: tuple[tuple[PlaceName, Place | None], ...] = (("watched", self.watched), ("found", self.found))
-        return {name: place for name, place in both if place is not None}
+    def candidates(self) -> list[Place]:
+        """The models in shadow that may be adopted."""
+        return [place for place in self.found if place.role == "candidate"]
 
     @property
     def candidate(self) -> Place | None:
-        """The candidate, if there is one."""
-        return self.found if self.found is not None and self.found.role == "candidate" else None
+        """The candidate that concerns a person: that is proposed, or else shows most."""
+        return max(self.candidates, key=lambda place: (place.is_proposed, place.shows), default=None)
 
     @property
     def proposed(self) -> Place | None:
         """The candidate that is proposed, if there is one."""
-        return self.candidate if self.candidate is not None and self.candidate.is_proposed else None
+        return next((place for place in self.candidates if place.is_proposed), None)
 
     @property
     def has_next(self) -> bool:
@@ -166,14 +175,18 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     @property
     def shown(self) -> Place | None:
         """The model in shadow that concerns a person first: the candidate, or else a model that was in force."""
-        return self.candidate or self.watched or self.found
+        return self.candidate or next(iter(self.taken), None)
 
     @property
     def phase(self) -> Phase:
         """What a person may have to answer to."""
-        if self.candidate is not None:
+        if self.candidates:
             return "proposed" if self.proposed is not None else "shadow"
         return "watching" if self.taken else "idle"
+
+
+class _Version(msgspec.Struct):
+    schema: int
 
 
 def decode_loop(data: bytes) -> LoopState:
@@ -185,9 +198,9 @@ def decode_loop(data: bytes) -> LoopState:
         If it is not a state of this version.
     """
     try:
-        found = msgspec.json.decode(data, type=LoopState)
+        schema = msgspec.json.decode(data, type=_Version).schema
+        if schema != STATE_SCHEMA:
+            raise DataError(f"loop.json: schema = {schema}, expected {STATE_SCHEMA}")
+        return msgspec.json.decode(data, type=LoopState)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"loop.json: {error}") from error
-    if found.schema != STATE_SCHEMA:
-        raise DataError(f"loop.json: schema = {found.schema}, expected {STATE_SCHEMA}")
-    return found

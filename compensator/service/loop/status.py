@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from compensator.messages import Candidate, LoopStatus
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.state import NO_VERDICT
+from compensator.service.loop.words import named
 from compensator.service.transfer.second_opinion import described
 
 
@@ -36,9 +37,10 @@ def loop_status(core: ModelLoop, candidates: Sequence[Candidate]) -> LoopStatus:
         present_rms_um=verdict.present_rms_um,
         candidate_rms_um=verdict.candidate_rms_um,
         deviations=verdict.deviations,
-        hours=core.loop.judged_h(shown) if shown is not None else 0.0,
+        hours=core.loop.compared(shown).judged_h if shown is not None else 0.0,
         probes=len(shown.comparison.probes) if shown is not None else 0,
         adopted_utc_ns=state.adopted_utc_ns,
         before_effects=before.effects if before is not None else None,
         before_text=described(before.verdict) if before is not None else "",
+        others=[f"{named(one.effects)}: {described(one.verdict)}" for one in state.candidates if one is not shown],
     )

@@ -121,7 +121,7 @@ class Comparison:
 
     def __init__(self, period_s: float, state: ComparisonState | None = None, *, axis: str = FIRST) -> None:
         self._fewest = _MEASURED * BLOCK_MIN * 60.0 / period_s
-        self._axis = axis
+        self._period_s, self._axis = period_s, axis
         self.state = state if state is not None else ComparisonState()
 
     def add(self, present: Outcome, candidate: Outcome, *, suspected: bool) -> bool:
@@ -206,14 +206,21 @@ class Comparison:
         hours = (self.state.last_ns - self.state.first_ns) / (3600 * NS)
         return changed(chosen, hours=hours)
 
+    def of_itself(self) -> Comparison:
+        """Return what was compared since the other model has been, without the one before it."""
+        state = self.state
+        blocks = [block for block in state.blocks if block.number * BLOCK_NS >= state.model_ns]
+        probes = [probe for probe in state.probes if probe.time_utc_ns >= state.model_ns]
+        own = msgspec.structs.replace(state, blocks=blocks, probes=probes, first_ns=max(state.first_ns, state.model_ns))
+        return Comparison(self._period_s, own, axis=self._axis)
+
     def is_itself_better(self) -> bool:
         """Return whether the other model is the better one since it has been compared, however clearly."""
-        blocks = [block for block in self.state.blocks if block.number * BLOCK_NS >= self.state.model_ns]
-        own, other, _ = _changes(blocks)
-        if own.size < FEWEST:
-            probes = [probe for probe in self.state.probes if probe.time_utc_ns >= self.state.model_ns]
-            own, other = np.array([(probe.own_um, probe.other_um) for probe in probes]).reshape(-1, 2).T
-        return own.size >= FEWEST and evidence(own, own - other).likelihood > 0.0
+        own = self.of_itself().state
+        values, other, _ = _changes(own.blocks)
+        if values.size < FEWEST:
+            values, other = np.array([(probe.own_um, probe.other_um) for probe in own.probes]).reshape(-1, 2).T
+        return values.size >= FEWEST and evidence(values, values - other).likelihood > 0.0
 
     # ------------------------------------------------------------------ blocks
 
@@ -296,6 +303,46 @@ class Comparison:
         y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
         scores = changed(scores, verdict=verdict, y_moved=y_moved, ratio=weighed.ratio)
         return changed(scores, deviations=shown, effective=weighed.effective)
+
+
+def beside(rival: ComparisonState, other: ComparisonState, *, level_um: float = 0.0) -> ComparisonState:
+    """Return the comparison of one model with another one, as if that were the present one, on the hours of both.
+
+    Parameters
+    ----------
+    rival, other : ComparisonState
+        Of the present model with the one that stands for it, and with the other one; of the first since it has been
+        compared itself.
+    level_um : float
+        By how much the level of the first one is raised, µm.
+    """
+    since = {block.number: block for block in rival.blocks if block.number * BLOCK_NS >= rival.model_ns}
+    zeros: dict[tuple[int, int], int] = {}
+    blocks = []
+    for block in other.blocks:
+        own = since.get(block.number)
+        if own is None or own.means is None or block.means is None:
+            continue
+        # Changes count about one zero of both.
+        zero = zeros.setdefault((own.zeros, block.zeros), len(zeros))
+        square = own.squares[1] + own.samples * level_um * (level_um - 2.0 * own.means[1])
+        means = (own.means[1] - level_um, block.means[1], block.means[2])
+        blocks.append(Block(zero, block.number, min(own.samples, block.samples), (square, block.squares[1]), means))
+    shown = {probe.time_utc_ns: probe.other_um for probe in rival.probes if probe.time_utc_ns >= rival.model_ns}
+    probes = [
+        ComparedProbe(probe.time_utc_ns, shown[probe.time_utc_ns], probe.other_um)
+        for probe in other.probes
+        if probe.time_utc_ns in shown
+    ]
+    begins_ns = [block.number * BLOCK_NS for block in blocks[:1]] + [probe.time_utc_ns for probe in probes[:1]]
+    return ComparisonState(
+        zeros=len(zeros),
+        blocks=blocks,
+        probes=probes,
+        first_ns=min(begins_ns, default=0),
+        last_ns=other.last_ns if begins_ns else 0,
+        model_ns=other.model_ns,
+    )
 
 
 def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:

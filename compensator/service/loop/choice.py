@@ -1,0 +1,77 @@
+"""Which of the candidates that are better than the present model is adopted or proposed.
+
+One that no other candidate surpasses: that is clearly better on the hours of both, by the rule of the verdict with the
+first one as the present model. Of several the one that shows most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from compensator.clock import NS
+from compensator.config import Loop as LoopSettings
+from compensator.service.loop.compared import Compared
+from compensator.service.loop.place import ADOPTION_H, is_asked, leads
+from compensator.service.loop.proof import is_clearly_better
+from compensator.service.loop.state import LoopState, Place
+
+
+class Choice:
+    """Chooses a candidate.
+
+    Parameters
+    ----------
+    state : LoopState
+        State of the loop.
+    settings : config.Loop
+        `[loop]`.
+    compared : callable
+        Returns what is compared of a model in shadow and the present one.
+    """
+
+    def __init__(self, state: LoopState, settings: LoopSettings, compared: Callable[[Place], Compared]) -> None:
+        self._state, self._settings, self._compared = state, settings, compared
+
+    def best(self, judged: Sequence[Place], now_ns: int) -> list[Place]:
+        """Return the candidates to choose from: what is proposed with a new verdict only."""
+        asked = self._state.proposed
+        if asked is not None and is_asked(asked, self._settings):
+            return []
+        return [
+            place
+            for place in sorted(self._state.candidates, key=lambda place: -place.shows)
+            if (place in judged or not place.is_proposed)
+            and self._compared(place).is_better(now_ns)
+            and not self._is_surpassed(place)
+        ]
+
+    def adopted(self, best: Sequence[Place], now_ns: int) -> Place | None:
+        """Return the one that is adopted without a person."""
+        if not self._may_adopt(now_ns):
+            return None
+        return next((place for place in best if self._compared(place).level_um is not None), None)
+
+    def proposed(self, best: Sequence[Place]) -> Place | None:
+        """Return the one that a person is asked about, in the place of a proposed one that it surpasses."""
+        before, by_hand = self._state.proposed, self._settings.policy == "propose"
+        for place in best:
+            is_next = before is None or (place is not before and self._surpasses(place, before))
+            if is_next and (by_hand or self._compared(place).level_um is None):
+                return place
+        return None
+
+    def _may_adopt(self, now_ns: int) -> bool:
+        """Return whether the loop may adopt a model now.
+
+        Not while the model before the last adoption is better so far: it would give its place to the present one.
+        """
+        state, since_ns = self._state, now_ns - self._state.adopted_utc_ns
+        if self._settings.policy != "adopt" or (state.adopted_utc_ns and since_ns < ADOPTION_H * 3600 * NS):
+            return False
+        return state.watched is None or not leads(state.watched.verdict, self._settings)
+
+    def _is_surpassed(self, place: Place) -> bool:
+        return any(self._surpasses(one, place) for one in self._state.candidates if one is not place)
+
+    def _surpasses(self, place: Place, rival: Place) -> bool:
+        return is_clearly_better(self._compared(place).beside(rival))
