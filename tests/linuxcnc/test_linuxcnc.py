@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.linuxcnc.control import NAMESPACES, ROOT, STARTS, STARVED, why_not
+from tests.linuxcnc.control import NAMESPACES, ROOT, STARTS, STARVED, is_starved, why_not
 
 REASON = why_not()
 pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(860)]
@@ -68,3 +68,8 @@ def test_only_a_starved_control_is_asked_again(
     done = run_scenario("scripted", place)
     assert len(list(place.iterdir())) == runs
     assert done.stderr == said[-1]
+
+
+def test_a_control_is_starved_where_its_own_task_says_so() -> None:
+    assert is_starved(f"...\n{STARVED}\n") and is_starved("task: main loop took 0.977323 seconds")
+    assert not is_starved("task: main loop took 0.110232 seconds")
