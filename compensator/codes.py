@@ -468,9 +468,9 @@ class ModelWarning(Code):
         "The effects that were found increase the error on held-out data, so the model was left unchanged.",
         "Record for longer, with more change in the inputs.",
     )
-    WORSE_FROM_REST = (
-        "worse_from_rest",
-        "The effects that were found increase the error of their own data in free run: the model was left unchanged.",
+    WORSE_IN_FREE_RUN = (
+        "worse_in_free_run",
+        "What would be deployed increases the error of its own data in free run, so the model was left unchanged.",
         "Record a run that begins at rest, with more change in the inputs.",
     )
     NOT_CONFIRMED = (

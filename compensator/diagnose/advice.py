@@ -44,7 +44,7 @@ class Unexplained:
         A source that is switched and that no channel shows; what the channels explain and no named effect does; or what
         nothing explains.
     rms_um, peak_to_peak_um : float
-        Its size, µm; `rms_um` without the noise of the data.
+        Its size, µm; `rms_um` without the noise of Y.
     tau_min : float
         Its time constant, min.
     times : tuple of (int, float)
@@ -94,7 +94,7 @@ class Advice:
     nearest : tuple of Near
         Logged channels that come nearest to it (where nothing is hidden: to what a named temperature explains).
     sensor : str
-        Where the next sensor should sit; empty where nothing is left, or less than the noise of a sample.
+        Where the next sensor should sit; empty where nothing is left, or less than the noise of Y.
     tests : tuple of PlannedTest
         Tests to run, the next one first.
     seen_once : tuple of SeenOnce
@@ -138,14 +138,14 @@ def advice_of(
         near = nearest(fit, found.selection.before.rest)[:LISTED]
     # A test that decides comes before one that would not.
     tests = sorted(between_rivals, key=lambda test: not test.decides)
-    # For what a single reading does not show nobody places a sensor.
-    needs_sensor = unexplained is not None and unexplained.rms_um >= found.search.evidence.noise.noise_um
-    if unexplained is not None and needs_sensor and unexplained.kind != "remainder":
-        tests.insert(0, _shown_again(unexplained, fit, deciding))
+    # For what a single reading of Y does not show nobody places a sensor, or makes a test.
+    wanted = unexplained if unexplained and unexplained.rms_um >= found.search.evidence.probe_um else None
+    if wanted is not None and wanted.kind != "remainder":
+        tests.insert(0, _shown_again(wanted, fit, deciding))
     return Advice(
         unexplained=unexplained,
         nearest=near,
-        sensor=_sensor(unexplained, near) if unexplained and needs_sensor else "",
+        sensor=_sensor(wanted, near) if wanted else "",
         tests=tuple(tests),
         seen_once=tuple(_seen_once(fit, deciding)),
     )
@@ -173,7 +173,8 @@ def _unexplained(found: Findings, *, explained_pct: float | None, is_explained: 
         return _described("remainder", found, course, _memory_min(course, evidence.context.period_min), [])
     if not is_explained:
         course = evidence.left(evidence.residual, found.whole, at_rest=False) * evidence.used
-        return _described("residual", found, course, fit.rest.tau_min, [])
+        left = _described("residual", found, course, fit.rest.tau_min, [])
+        return left if left.rms_um > 0.0 else None
     return None
 
 
@@ -186,7 +187,7 @@ def _described(
 ) -> Unexplained:
     evidence = found.search.evidence
     used = course[evidence.used]
-    noise_um = evidence.noise.noise_um if kind == "residual" else 0.0
+    noise_um = evidence.probe_um if kind == "residual" else 0.0
     times = sorted(switched or steepest(evidence, course, TIMES))
     tolerance = max(MEET_SAMPLES * evidence.context.period_min, min(MEET_SHARE * tau_min, MEET_MIN))
     event = goes_with(evidence, times, tolerance if switched else MEET_MIN)

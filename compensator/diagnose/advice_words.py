@@ -28,7 +28,7 @@ def advice_lines(advice: Advice | None) -> list[str]:
         if alike := resembling(advice.nearest):
             named = ", ".join(f"{near.channel} (log evidence +{roughly(near.evidence)})" for near in alike[:3])
             lines.append(f"Logged channels that resemble it most: {named}.")
-        lines += [advice.sensor] if advice.sensor else []
+        lines.append(advice.sensor or "No sensor is advised for that: it is less than the noise of Y.")
     lines += [f"Next test, {_purpose(test)}: {test.sentence}" for test in advice.tests[:SAID]]
     lines += [_repeat(seen) for seen in advice.seen_once[:SAID]]
     return lines

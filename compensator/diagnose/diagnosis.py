@@ -21,7 +21,7 @@ from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of, from_rest, with_paths
+from compensator.diagnose.findings import Findings, findings_of, in_free_run, with_paths
 from compensator.diagnose.fit import Term, fit_terms, late_term
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
@@ -41,10 +41,9 @@ from compensator.progress import ExecutorMap, Progress, unreported
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
-#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor: the base's paths are
-#: kept, or fitted anew, where each block knows less of them than the whole. The first one holds for the data that were
-#: searched, too, in free run from rest.
-CONTRADICTS = (1.25, 2.5)
+#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor, or the data that were
+#: searched are in free run. Where the base's paths are fitted anew each block knows less of them than the whole.
+CONTRADICTS, CONTRADICTS_ANEW = 1.25, 2.5
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
 #: Beside a late T_Q it is for the minutes that a dead time hides: they are most of what is left, or something else is
@@ -94,17 +93,16 @@ def diagnose(
     held_out = held_out_of(found, places, progress, executor_map)
     found, effects, held_out = _worth_deploying(found, effects, held_out)
     few = evidence.is_sparse
-    # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
-    factor = CONTRADICTS[evidence.free_paths]
-    contradicted = not few and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
     reverses = any(effect.reverses_path for effect in effects)
-    base_um, own_um = from_rest(found)
-    worse = (base_um, own_um) if not few and own_um > CONTRADICTS[False] * base_um else None
-    refused = contradicted or reverses or worse is not None
+    worse_um = _worse_in_free_run(found)
+    refused = _contradicted(found, held_out) or reverses or worse_um is not None
+    if refused:
+        effects = _not_replaced(effects)
     extended, remarks = (model, ()) if refused else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
-    (verdict, is_explained), ceiling = _verdict(found, effects, held_out, extended), _ceiling(held_out)
+    ceiling = _ceiling(held_out)
+    verdict, is_explained = _verdict(found, effects, held_out, extended, holds_in_free_run=worse_um is None)
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
@@ -119,7 +117,13 @@ def diagnose(
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
-        effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, from_rest=worse, start_k=evidence.start_k
+        effects,
+        held_out.nothing,
+        held_out.whole,
+        deployed=deployed,
+        few=few,
+        worse_um=worse_um,
+        start_k=evidence.start_k,
     )
     return Diagnosis(
         verdict="unexplained" if hides or reverses else verdict,
@@ -176,9 +180,30 @@ def _worth_deploying(
         helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
     if helps:
         return found, effects, held_out
-    named = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
     without = dataclasses.replace(held_out, whole=held_out.named)
-    return dataclasses.replace(found, remainder=None, explains=True), named, without
+    return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
+
+
+def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
+    """Return effects in whose place no remainder is deployed."""
+    return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
+
+
+def _contradicted(found: Findings, held_out: HeldOut) -> bool:
+    """Return whether held-out blocks contradict what was found; few values do not decide that.
+
+    Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
+    """
+    evidence = found.search.evidence
+    factor = CONTRADICTS_ANEW if evidence.free_paths else CONTRADICTS
+    return not evidence.is_sparse and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
+
+
+def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
+    """Return what is left in free run without and with what would be deployed, µm rms, if that is clearly worse."""
+    base_um, own_um = in_free_run(found)
+    is_worse = not found.search.evidence.is_sparse and own_um > CONTRADICTS * base_um
+    return (base_um, own_um) if is_worse else None
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:
@@ -358,7 +383,12 @@ def _ranked(found: Findings, effects: Sequence[FoundEffect]) -> tuple[tuple[str,
 
 
 def _verdict(
-    found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut, extended: ThermalModel
+    found: Findings,
+    effects: Sequence[FoundEffect],
+    held_out: HeldOut,
+    extended: ThermalModel,
+    *,
+    holds_in_free_run: bool,
 ) -> tuple[Verdict, bool]:
     """Return the verdict in one word, and whether nothing is left to look for.
 
@@ -389,6 +419,6 @@ def _verdict(
     def holds(values: Vector) -> bool:
         return rms_of(values) ** 2 <= most_um2
 
-    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains
+    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains and holds_in_free_run
     by_names = leaves_noise(found.named) and holds(held_out.named) and all(e.is_determined for e in effects)
     return ("explained" if nothing_left and by_names else "partly_explained"), nothing_left

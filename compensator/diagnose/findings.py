@@ -111,14 +111,17 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
         That of a search over all data, where something is held out.
     """
     found = _findings_of(evidence, grid, unobserved=unobserved)
-    if any(not term.effect.observed for term in found.terms) and _is_worse(found):
-        # The effects make up for the source. Channels that explain most of it alone take their place.
-        shown = _findings_of(evidence, grid, unobserved=False)
-        rms = found.search.criterion.rms
-        nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
-        if nothing - left > MOSTLY * (nothing - hidden):
-            return shown
-    return found
+    if evidence.is_sparse or all(term.effect.observed for term in found.terms):
+        return found
+    before_um, after_um = in_free_run(found)
+    if after_um <= before_um:
+        return found
+    # The effects make up for the source. Channels that explain most of it alone take their place.
+    shown = _findings_of(evidence, found.search.grid, unobserved=False)
+    rms = found.search.criterion.rms
+    nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
+    is_better = in_free_run(shown)[1] < after_um
+    return shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
 
 
 def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> Findings:
@@ -156,11 +159,12 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
     )
 
 
-def from_rest(found: Findings) -> tuple[float, float]:
-    """Return what is left of the data in free run by the base model and with what can be deployed, µm rms.
+def in_free_run(found: Findings) -> tuple[float, float]:
+    """Return what the base model leaves of the data in free run, and with what would be deployed, µm rms.
 
-    Only the zero of each run is unknown, and a source that no channel shows is missing: so it runs in service. What
-    depends on time alone is an error of the measurement and counts neither way.
+    Without a source that no channel shows, and with nothing unknown but the zero of each run, as in service; where a
+    warm start was estimated (`with_initial_state`), with an initial state. What depends on time alone is an error of
+    the measurement and counts neither way.
     """
     evidence = found.search.evidence
     hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
@@ -169,19 +173,17 @@ def from_rest(found: Findings) -> tuple[float, float]:
             hidden += added
         elif not term.effect.deployable:
             of_time += added
+    if not found.explains:  # the remainder is for all of it, and stands in the place of every effect
+        hidden, of_time = np.zeros_like(hidden), np.zeros_like(of_time)
     if evidence.free_paths:  # the residual is all of y
         base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
+    at_rest = all(signals.initial_um is None for signals in evidence.signals)
 
     def left_um(added: Vector) -> float:
-        left = evidence.left(evidence.residual - of_time, added, at_rest=True)[evidence.used]
+        left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]
         return float(np.sqrt(np.mean(left**2)))
 
-    return left_um(base), left_um(found.whole - (hidden + of_time) * found.explains)
-
-
-def _is_worse(found: Findings) -> bool:
-    before_um, after_um = from_rest(found)
-    return after_um > before_um
+    return left_um(base), left_um(found.whole - hidden - of_time)
 
 
 def _has_own_error(fit: Fit) -> bool:

@@ -50,9 +50,8 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     blocks = list(evidence.blocks(FOLDS))
     progress(1, len(blocks) + 1)
     views = [evidence.without(block) for block in blocks]
-    timed = [t.effect for t in found.terms if not t.effect.deployable]
-    only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
-    unobserved = any(not effect.observed for effect in timed) and not only_unobserved
+    hidden = [not term.effect.observed for term in found.terms]
+    unobserved = any(hidden) and not all(hidden)
     # Another process computes the columns sooner than it gets them.
     grid = found.search.grid if executor_map is map else None
     predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=grid), views)

@@ -203,7 +203,7 @@ def warnings_of(
     *,
     deployed: bool,
     few: bool = False,
-    from_rest: tuple[float, float] | None = None,
+    worse_um: tuple[float, float] | None = None,
     start_k: float = 0.0,
 ) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found.
@@ -218,20 +218,19 @@ def warnings_of(
         Whether the extended model has any.
     few : bool
         Whether Y was measured now and then, so that held-out blocks do not decide what is deployed.
-    from_rest : tuple of float, optional
-        What is left of the data in free run without and with those that can be deployed, µm rms, where that is clearly
-        worse.
+    worse_um : tuple of float, optional
+        What is left in free run without and with what would be deployed, µm rms, where that is clearly worse.
     start_k : float
         T_Q − AT at the coolest start, K, where that is not at rest as far as T_Q shows; 0 where it is.
     """
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
-    if from_rest is not None:
+    if worse_um is not None:
         text = (
-            "In free run, from rest, the effects that can be deployed increase the error of the same data "
-            f"({from_rest[1]:.2f} against {from_rest[0]:.2f} µm rms), so the model was left unchanged."
+            "In free run over the same data (zero of each run fitted) what would be deployed increases the error "
+            f"({worse_um[1]:.2f} against {worse_um[0]:.2f} µm rms), so the model was left unchanged."
         )
-        warnings.append(Remark(ModelWarning.WORSE_FROM_REST, text))
+        warnings.append(Remark(ModelWarning.WORSE_IN_FREE_RUN, text))
     # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
     elif any(effect.effect.observed for effect in effects) and rms_after > rms_before:
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"

@@ -57,7 +57,7 @@ _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
     "left unchanged."
 )
-#: The verdict if they increase the error of their own data in free run.
+#: The verdict if what would be deployed increases the error of its own data in free run.
 _NOT_IN_FREE_RUN = (
     "The model lacks an effect; the best explanation found increases the error in free run over the same data, so the "
     "model was left unchanged."
@@ -229,7 +229,7 @@ def _words(found: Mapping[str, Any]) -> str:
         words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
     if ModelWarning.PATH_REVERSED in found["warning_codes"]:
         words = _REVERSED
-    elif ModelWarning.WORSE_FROM_REST in found["warning_codes"]:
+    elif ModelWarning.WORSE_IN_FREE_RUN in found["warning_codes"]:
         words = _NOT_IN_FREE_RUN
     elif ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD

@@ -13,7 +13,7 @@ from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import findings as module
 from compensator.diagnose.diagnosis import _evidence
-from compensator.diagnose.findings import findings_of, from_rest
+from compensator.diagnose.findings import findings_of, in_free_run
 from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.summary import verdict
 from sim_hardware.drawn_machines.cases import _cases
@@ -34,48 +34,54 @@ def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, explains:
         used=np.ones(residual.size, dtype=bool),
         left=lambda raw, added, at_rest: raw - added,
         free_paths=False,
-        signals=[SimpleNamespace(y_dtf_um=7.0 * HEAT, y_tdtf_um=HEAT)],
+        is_sparse=False,
+        signals=[SimpleNamespace(y_dtf_um=7.0 * HEAT, y_tdtf_um=HEAT, initial_um=None)],
     )
     return SimpleNamespace(
         search=SimpleNamespace(evidence=evidence),
         terms=[SimpleNamespace(effect=kinds[kind]) for kind, _ in effects],
         responses=[added for _, added in effects],
         whole=np.sum([added for _, added in effects], axis=0),
-        paths=np.zeros(residual.size),
         explains=explains,
     )
 
 
 def test_an_effect_that_makes_up_for_a_source_is_worse_alone() -> None:
-    before_um, after_um = from_rest(of([("hidden", 20.0 * HEAT), ("gain", -19.0 * HEAT)], HEAT))
+    before_um, after_um = in_free_run(of([("hidden", 20.0 * HEAT), ("gain", -19.0 * HEAT)], HEAT))
     assert before_um == pytest.approx(np.sqrt(np.mean(HEAT**2)))
     assert after_um == pytest.approx(20.0 * before_um)
 
 
 def test_an_effect_beside_a_source_of_its_own_is_not() -> None:
     residual = 20.0 * SOURCE + 5.0 * HEAT
-    before_um, after_um = from_rest(of([("hidden", 20.0 * SOURCE), ("gain", 5.0 * HEAT)], residual))
+    before_um, after_um = in_free_run(of([("hidden", 20.0 * SOURCE), ("gain", 5.0 * HEAT)], residual))
     assert after_um == pytest.approx(20.0 * np.sqrt(np.mean(SOURCE**2))) and after_um < before_um
 
 
 def test_a_drift_counts_neither_way() -> None:
     # With the drift in the data the effect would seem to increase the error.
     drift = -6.0 * HEAT
-    before_um, after_um = from_rest(of([("gain", 5.0 * HEAT), ("drift", drift)], 5.0 * HEAT + drift))
+    before_um, after_um = in_free_run(of([("gain", 5.0 * HEAT), ("drift", drift)], 5.0 * HEAT + drift))
     assert before_um == pytest.approx(5.0 * np.sqrt(np.mean(HEAT**2))) and after_um == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_remainder_in_the_place_of_effects_is_for_the_drift_too() -> None:
+    found = of([("gain", 3.0 * HEAT), ("drift", -6.0 * SOURCE)], 5.0 * HEAT - 6.0 * SOURCE, explains=False)
+    found.whole = 5.0 * HEAT - 6.0 * SOURCE
+    assert in_free_run(found)[1] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_where_paths_are_free_the_base_model_is_taken_as_it_is() -> None:
     # y is 9 HEAT, the base says 8 of it.
     found = of([("gain", 9.0 * HEAT)], 9.0 * HEAT)
     found.search.evidence.free_paths = True
-    before_um, _ = from_rest(found)
+    before_um, _ = in_free_run(found)
     assert before_um == pytest.approx(np.sqrt(np.mean(HEAT**2)))
 
 
 def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    # y grows with the square of the path. Before, a source of two switchings made up for changed paths: left alone
-    # these left more on the record than nothing, and on another day 25 instead of 14.5 µm.
+    # y grows with the square of the path. With a source of two switchings changed paths explain it, too; alone they
+    # leave more of the record than nothing, and of another day 25 instead of 14.5 µm.
     machine = next(c for c in _cases(50_000) if (c.family, c.seed) == ("transfer", 50_037)).draw()
     searched = []
     once = module._findings_of
@@ -90,14 +96,14 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     found = findings_of(_evidence(base, runs))
     first, second = searched
     assert found is second
-    before_um, after_um = from_rest(first)
-    assert after_um > before_um and from_rest(second)[1] < 0.5 * before_um
+    before_um, after_um = in_free_run(first)
+    assert after_um > before_um and in_free_run(second)[1] < 0.5 * before_um
     assert any(not term.effect.observed for term in first.terms)
     assert [term.hypothesis.place for term in found.terms] == [("nonlinear", "DTF", "")]
 
 
 def test_it_is_said_why_nothing_is_deployed() -> None:
-    [remark] = warnings_of([], np.ones(9), 0.5 * np.ones(9), deployed=False, from_rest=(0.91, 9.4))
-    assert remark.code == ModelWarning.WORSE_FROM_REST and "(9.40 against 0.91 µm rms)" in remark
+    [remark] = warnings_of([], np.ones(9), 0.5 * np.ones(9), deployed=False, worse_um=(0.91, 9.4))
+    assert remark.code == ModelWarning.WORSE_IN_FREE_RUN and "(9.40 against 0.91 µm rms)" in remark
     words = verdict(diagnosed(verdict="partly_explained", warning_codes=[str(remark.code)]))
     assert "increases the error in free run" in words and "were found" not in words

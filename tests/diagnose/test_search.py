@@ -18,6 +18,7 @@ from compensator.display import is_determined
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
+from compensator.report.diagnosis import tone_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.effects.mechanical import StickSlip
 from tests.diagnose.scenarios import KINDS, draw, record
@@ -185,9 +186,10 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
     # The same where its own data contradict what would be deployed, in free run.
     times = 0.1
-    monkeypatch.setattr(diagnosis_module, "from_rest", lambda _: (1.0, 1.3))
+    monkeypatch.setattr(diagnosis_module, "in_free_run", lambda _: (1.0, 1.3))
     bad = diagnose(QUILL, runs_from(columns))
-    assert not bad.model.effects and "worse_from_rest" in [warning.code for warning in bad.warnings]
+    assert bad.verdict == "partly_explained" and tone_of(figures(bad)) == "warn"
+    assert not bad.model.effects and "worse_in_free_run" in [warning.code for warning in bad.warnings]
     assert "in free run over the same data" in verdict(figures(bad))
 
 
