@@ -48,7 +48,7 @@ async def test_what_the_service_publishes_is_what_the_plc_holds(tmp_path: Path) 
             for far_um in (1.5, 3.0):
                 process = site.start()
                 try:
-                    await until(partial(moved, far_um), f"the PLC follows: {said[-1:]}")
+                    await until(partial(moved, far_um), lambda: f"the PLC follows: {said[-3:]}")
                 finally:
                     end(process)  # kill −9
                 await until(holds, "the PLC holds")

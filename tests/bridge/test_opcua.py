@@ -61,10 +61,12 @@ def written(folder: Path, endpoint: str = "opc.tcp://127.0.0.1:4840", zenoh: int
     return path
 
 
-async def until(condition: Callable[[], Awaitable[Any]], what: str, timeout_s: float = 120.0) -> None:
+async def until(
+    condition: Callable[[], Awaitable[Any]], what: str | Callable[[], str], timeout_s: float = 120.0
+) -> None:
     end = time.monotonic() + timeout_s
     while not await condition():
-        assert time.monotonic() < end, f"not within {timeout_s} s: {what}"
+        assert time.monotonic() < end, f"not within {timeout_s} s: {what() if callable(what) else what}"
         await asyncio.sleep(0.02)
 
 

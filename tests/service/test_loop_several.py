@@ -15,6 +15,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, Note
 from compensator.recording.reading import messages, recordings
+from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.proof import CANDIDATES, shared
 from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
@@ -50,6 +51,7 @@ LATER = 36 * 60
 NOTHING = shown(None, "adequate")
 HOUR_NS = 3600 * NS
 NOW_NS = 100 * HOUR_NS
+DAY_NS = 24 * HOUR_NS
 
 
 def about(notes: list[Note]) -> list[tuple[str, str]]:
@@ -317,3 +319,34 @@ async def test_an_answer_to_a_candidate_that_has_given_its_place_is_refused(tmp_
     assert f"candidate {sha256_of(extended())[:12]} has given its place" in refused.text
     assert service.store.in_use() == QUILL_FILE and service.candidates()[-1].model_sha256 == sha256_of(extended(2.0))
     checked(service)
+
+
+def newer_parameters() -> Loop:
+    """A loop with one candidate, and newer parameters of its effects that are warmed up."""
+    loop = Loop(settings().loop, 60.0, [])
+    loop.state.found = [Place(sha256="a" * 64, effects=["gain DTF"], role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
+    loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
+    found = DiagnosisData(verdict="explained", candidate_sha256="b" * 64, effects=["gain DTF"])
+    assert loop.receive(found, NOW_NS) == [] and loop.state.diagnosis is not None
+    return loop
+
+
+def test_newer_parameters_of_what_a_person_dismisses_do_not_begin() -> None:
+    loop = newer_parameters()
+    assert about(loop.dismiss(NOW_NS)) == [("end", "dismissed")]
+    assert loop.begin() == [] and loop.state.diagnosis is None and not loop.state.found
+
+
+def test_a_proposal_that_is_taken_over_is_withdrawn() -> None:
+    loop = newer_parameters()
+    loop.state.found[0].is_proposed = True
+    assert about(loop.begin()) == [("withdraw", "taken_over"), ("shadow", "")]
+
+
+def test_what_is_in_force_again_does_not_run_beside_itself() -> None:
+    # Weighed while it was in shadow; the service has gone back to it since.
+    core = ModelLoop(settings(), QUILL, {})
+    core.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
+    found = DiagnosisData(verdict="adequate", candidate_sha256=QUILL.sha256, calibrated=True, in_shadow=True)
+    assert about(core.receive(found, NOW_NS)) == [("nothing", "unchanged")]
+    assert core.state.diagnosis is None

@@ -81,8 +81,8 @@ class Compared:
     def judge(self) -> None:
         """Make the verdict anew.
 
-        One that has taken over is judged by all values or by its own alone, whichever show more: it is no worse off
-        than beside the one before. These are two cases.
+        One that has taken over is judged by all values or by its own alone, whichever show more. So it is one case more
+        by itself; in its first hours, which show nothing, it does not end as worse.
         """
         place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
         cases = self._candidates + has_taken_over if place.role == "candidate" else 1

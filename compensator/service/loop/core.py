@@ -161,6 +161,9 @@ class ModelLoop:
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis."""
+        if found.candidate_sha256 == self.present.sha256:
+            # It has come back since the diagnosis was weighed: nothing runs beside itself.
+            found = msgspec.structs.replace(found, same_effects=True, change_deviations=0.0, in_shadow=False)
         return self.loop.receive(found, now_ns)
 
     @property

@@ -125,7 +125,7 @@ class Loop:
             elif compared.add_suspected(other) and place.is_proposed and not state.exchange:
                 notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
         for place in state.taken:
-            # What the next one takes over decides nothing any longer.
+            # Until what is warmed up has its place, before the next sample, nothing that was found decides.
             if not state.exchange and (place is state.watched or not state.has_next):
                 notes += self._decide(place, now_ns, present, others[place.sha256], is_judged=place in judged)
         if not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
@@ -251,7 +251,10 @@ class Loop:
         return [nothing_follows(why, found)] if why else []
 
     def begin(self) -> list[Note]:
-        """Say that what is warmed up gets a place before the next sample, and what gives its own for it."""
+        """Say that what is warmed up gets a place before the next sample, and what gives its own for it; or nothing.
+
+        Nothing follows where a person is asked about the same effects meanwhile.
+        """
         state, running = self.state, self.state.diagnosis
         if running is None or running.found is None or running.is_next or state.exchange:
             return []
@@ -262,6 +265,9 @@ class Loop:
             return [nothing_follows("in_shadow", found)]
         last = gives_way(state) if before is None else None
         notes = self._end(last, "gives_way") if last is not None else []
+        if before is not None and before.is_proposed:
+            text = "newer parameters of the same effects take over, and are proposed once their own hours show it"
+            notes += self._withdraw(before, text, why="taken_over")
         state.diagnosis = msgspec.structs.replace(running, is_next=True)
         return [*notes, begins(found)]
 
@@ -353,6 +359,9 @@ class Loop:
         if self.state.exchange:
             return []
         avoid(self.state, candidate.effects, now_ns, self._settings.watch_h)
+        running = self.state.diagnosis
+        if running is not None and running.found is not None and running.found.effects == candidate.effects:
+            self.state.diagnosis = None  # newer parameters of them are warmed up: they are refused, too
         return self._end(candidate, "dismissed")
 
     def _meant(self, sha256: str, command: str) -> Place:

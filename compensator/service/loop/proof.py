@@ -23,9 +23,10 @@ _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIM
 def shared(deviations: float, candidates: int) -> float:
     """Return by how many standard deviations one of so many candidates in shadow must refute the present model.
 
-    If that is right, the likelihood ratio L of each has the expectation 1, and so has the mean of all, whatever they
-    have in common: the mean ever exceeds e^(deviations² / 2) as rarely as L of a single candidate does (`evidence`).
-    Before that no L exceeds their number times as much. One that is alone again shares with none.
+    If that is right, the likelihood ratio L of each has the expectation 1, and so has the mean of those that run
+    together, whatever they have in common: it ever exceeds e^(deviations² / 2) as rarely as L of a single one does
+    (`evidence`), and before that no L exceeds their number times as much. Candidates that come one after another share
+    nothing: each is a case of its own, and so is one that is alone again. The bound holds for what is remembered.
 
     Examples
     --------
