@@ -168,13 +168,13 @@ def in_free_run(found: Findings) -> tuple[float, float]:
     """
     evidence = found.search.evidence
     hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
-    for term, added in zip(found.terms, found.responses, strict=True):
+    # A remainder in the place of effects is for all of it.
+    effects = zip(found.terms, found.responses, strict=True) if found.explains else ()
+    for term, added in effects:
         if not term.effect.observed:
             hidden += added
         elif not term.effect.deployable:
             of_time += added
-    if not found.explains:  # the remainder is for all of it, and stands in the place of every effect
-        hidden, of_time = np.zeros_like(hidden), np.zeros_like(of_time)
     if evidence.free_paths:  # the residual is all of y
         base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
     at_rest = all(signals.initial_um is None for signals in evidence.signals)

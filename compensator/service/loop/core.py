@@ -163,7 +163,7 @@ class ModelLoop:
         """Decide what follows from a diagnosis."""
         if found.candidate_sha256 == self.present.sha256:
             # It has come back since the diagnosis was weighed: nothing runs beside itself.
-            found = msgspec.structs.replace(found, same_effects=True, change_deviations=0.0, in_shadow=False)
+            found = replace_fields(found, same_effects=True, change_deviations=0.0, in_shadow=False)
         return self.loop.receive(found, now_ns)
 
     @property
