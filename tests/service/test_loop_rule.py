@@ -11,7 +11,7 @@ from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.state import Place
-from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block
+from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block, ComparisonState
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
@@ -86,6 +86,48 @@ def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_
         ("b", "not_judged"),
     ]
     assert loop.state.found[0].verdict == shown and loop.state.candidate is first
+
+
+def taken_over(blocks: int, own: int, wrong: float) -> Compared:
+    """What is compared of newer parameters, with as many blocks before them and as many of their own."""
+    rng = np.random.default_rng(9)
+    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=blocks * BLOCK_NS)
+    for n in range(blocks + own):
+        moves, error = 2.0 * float(rng.normal()), 2.0 * float(rng.normal())
+        means = (error, error - wrong * moves, moves)
+        place.comparison.blocks.append(Block(int(n >= blocks), n, 30, (30 * means[0] ** 2, 30 * means[1] ** 2), means))
+    place.comparison.zeros, place.comparison.model_ns = 1, blocks * BLOCK_NS
+    place.comparison.first_ns, place.comparison.last_ns = 1, (blocks + own) * BLOCK_NS
+    compared = Compared(place, LoopSettings(), 60.0, ErrorBlocks())
+    compared.judge()
+    return compared
+
+
+@pytest.mark.parametrize("own", [0, 2])
+def test_before_their_own_hours_judge_all_hours_are_said_and_end_nothing(own: int) -> None:
+    slightly, clearly = (taken_over(40, own, wrong) for wrong in (0.4, 2.0))
+    assert slightly._place.verdict.verdict == "alike" and -4.0 < slightly._place.shows < 0.0
+    assert clearly._place.verdict.verdict == "worse" and not clearly.is_worse
+    assert taken_over(40, 30, 2.0).is_worse
+
+
+def test_two_candidates_are_compared_by_blocks_of_the_same_samples() -> None:
+    """A zero divides the half hour 3 for both; in the half hour 6 the second one has taken over."""
+    compared = [Place(sha256=name * 64, effects=[], role="candidate", since_utc_ns=1) for name in "ab"]
+    for place, by in zip(compared, (1.0, 2.0), strict=True):
+        parts = [(0, 2), (0, 3), (1, 3), (1, 4), (1, 5), *([(1, 6)] if by == 1.0 else [(1, 6), (2, 6)]), (2, 7)]
+        means = [(0.0, by * (10 * zero + number), 0.0) for zero, number in parts]
+        rows = zip(parts, means, strict=True)
+        place.comparison.blocks = [Block(*part, 15, (0.0, 0.0), mean) for part, mean in rows]
+    state = beside_state(compared[1], compared[0])
+    assert [block.number for block in state.blocks] == [2, 3, 3, 4, 5, 7]
+    assert all(block.means is not None and block.means[1] == 2.0 * block.means[0] for block in state.blocks)
+    assert len({block.zeros for block in state.blocks}) == 3
+
+
+def beside_state(place: Place, rival: Place) -> ComparisonState:
+    Compared(place, LoopSettings(), 60.0, ErrorBlocks()).go_on_beside(rival, 0.0)
+    return place.comparison
 
 
 @pytest.mark.parametrize("right_from", [0, 40])

@@ -80,9 +80,9 @@ def stronger_dtf(change: float, acts: Callable[[int], bool]) -> Callable[[int], 
     return lambda i: crept(i) + change * float(y_um[i]) * acts(i)
 
 
-def place(name: str, deviations: float | None, *, role: Any = "candidate") -> Place:
+def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> Place:
     found = Place(sha256=name * 64, effects=[f"gain:{name}"], role=role, since_utc_ns=NOW_NS - 8 * HOUR_NS)
-    found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations)
+    found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations, hours=hours)
     return found
 
 
@@ -106,6 +106,69 @@ def test_where_all_places_are_taken_what_shows_least_gives_way(role: Any) -> Non
     loop.shadow_begins("n" * 64, ["gain:DTF"], NOW_NS)
     assert [one.sha256[0] for one in loop.state.found] == ["a", "c", "n"]
     assert loop.state.found[0].verdict.deviations == 2.0
+
+
+@pytest.mark.parametrize(
+    ("others", "gives_way"),
+    [
+        (({"deviations": 0.5}, {"deviations": 0.2}), "c"),  # what has just begun stays
+        (({"deviations": 2.0, "hours": 30.0}, {"deviations": 1.5}), "b"),  # by the hour
+        (({"deviations": -2.0}, {"deviations": -2.0, "hours": 30.0}), "b"),
+        (({"deviations": 1.0, "hours": 3.0}, {"deviations": -1.0, "hours": 3.0}), "c"),  # of those that have no chance
+    ],
+)
+def test_what_promises_least_by_the_hour_gives_way_and_nothing_by_noise(others: Any, gives_way: str) -> None:
+    young = place("a", None, hours=0.0)
+    loop = full(young, *(place(name, **settings) for name, settings in zip("bc", others, strict=True)))
+    loop.receive(found(["gain:DTF"]), NOW_NS)
+    ended, _ = loop.begin()
+    assert ended.data["why"] == "gives_way" and ended.data["model_sha256"][0] == gives_way
+
+
+class Stands:
+    """Stands for what is compared of a candidate that is better than the present model."""
+
+    def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
+        self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
+        self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
+
+    def is_better(self, now_ns: int) -> bool:
+        return True
+
+    def beside(self, rival: Place) -> ComparisonData:
+        self.asked.append(rival.sha256)
+        if rival.sha256[0] not in self._surpasses:
+            return ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=0.0, ratio=1.0)
+        return ComparisonData(
+            verdict=ComparisonVerdict.BETTER, deviations=9.0, ratio=0.3, present_rms_um=3.0, candidate_rms_um=1.0
+        )
+
+
+def chosen(*stand: Stands) -> list[tuple[str, str]]:
+    """Return what a loop decides about candidates after new verdicts; each pair is compared at most once."""
+    loop = full(*(one.one for one in stand))
+    loop.state.diagnosis = None
+    loop.compared = lambda one: next(found for found in stand if found.one is one)  # type: ignore
+    notes = loop._choose([one.one for one in stand], NOW_NS)
+    assert all(len(one.asked) == len(set(one.asked)) for one in stand)
+    return [(note.data["step"], note.data["model_sha256"][0]) for note in notes]
+
+
+def test_what_has_more_effects_and_whose_level_is_not_known_keeps_out_none_that_can_be_adopted() -> None:
+    part, whole, other = place("a", 5.0), place("b", 8.0), place("c", 6.0)
+    whole.effects = [*part.effects, "gain:more"]
+    for level_um, decision in ((None, ("adopt", "a")), (0.0, ("adopt", "b"))):
+        assert chosen(Stands(part), Stands(whole, "a", level_um)) == [decision]
+    # Measured Y speaks against the effect of a: it has none of those of c.
+    assert chosen(Stands(part), Stands(other, "a", None)) == [("propose", "c")]
+    assert chosen(Stands(part), Stands(whole, "a", None), Stands(other, "a")) == [("adopt", "c")]
+
+
+def test_a_pair_of_candidates_is_compared_once() -> None:
+    proposed = place("a", 5.0)
+    proposed.is_proposed = True
+    stand = Stands(proposed, "", None), Stands(place("b", 8.0), "ac", None), Stands(place("c", 6.0), "a", None)
+    assert chosen(*stand) == [("withdraw", "a"), ("propose", "b")]
 
 
 @pytest.mark.parametrize("policy", ["propose", "adopt"])

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, Note
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
 from compensator.recording.reading import recordings
@@ -25,10 +25,12 @@ from compensator.service.compensation import Compensation
 from compensator.service.loop import live
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.found import Found
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.weighing import Weighed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import candidate, model_store
@@ -214,23 +216,86 @@ def test_a_candidate_neither_replaces_a_decided_exchange_nor_outlives_it() -> No
         loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
         loop.state.exchange, loop.state.incoming = "adopt", "b" * 64
         running = loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=1, why="planned", candidate_sha256=sha256)
-        assert loop.exchanged(now_ns, "d" * 64)
+        loop.state.watched = None
+        assert loop.exchanged(now_ns, "d" * 64) == []
         assert loop.state.diagnosis == (None if sha256 else running)
         assert loop.state.phase == "watching" and loop.state.watched is not None
         assert loop.state.watched.sha256 == "d" * 64 and loop.state.found == []
 
 
 def test_after_a_way_back_what_is_avoided_or_in_force_is_compared_no_longer() -> None:
-    for sha256, effects, stays in (
-        ("b" * 64, ["input:coolant_degc"], True),
-        ("b" * 64, ["gain:DTF"], False),  # it was gone back from these
-        ("a" * 64, [], False),
+    for sha256, effects, why in (
+        ("b" * 64, ["input:coolant_degc"], ""),
+        ("b" * 64, ["gain:DTF"], "avoided"),  # it was gone back from these
+        ("a" * 64, [], "replaced"),
     ):
         loop, now_ns = watching(judged(ComparisonVerdict.BETTER, 9.0, 0.3))
         loop.shadow_begins(sha256, effects, now_ns, role="candidate" if effects else "before")
         loop.state.exchange, loop.state.incoming = "back", "a" * 64
-        assert not loop.exchanged(now_ns + HOUR_NS, "d" * 64)
-        assert loop.state.watched is None and bool(loop.state.found) == stays
+        ends = [(note.data["step"], note.data["why"]) for note in loop.exchanged(now_ns + HOUR_NS, "d" * 64)]
+        assert ends == ([("end", why)] if why else [])
+        assert loop.state.watched is None and bool(loop.state.found) == (not why)
+        assert loop.state.place("d" * 64) is None
+
+
+@pytest.mark.parametrize("action", ["adopt", "back"])
+def test_the_model_before_that_an_exchange_leaves_without_a_place_ends_with_an_event(action: Any) -> None:
+    loop, now_ns = watching(judged(ALIKE, 0.5, 1.0))
+    loop.shadow_begins("c" * 64, ["delay:DTF"], now_ns, role="candidate" if action == "adopt" else "before")
+    loop.state.exchange, loop.state.incoming = action, "c" * 64
+    (note,) = loop.exchanged(now_ns + HOUR_NS, "d" * 64)
+    assert (note.data["step"], note.data["why"], note.data["model_sha256"]) == ("end", "replaced", "a" * 64)
+    assert note.data["role"] == "before"
+
+
+def begun() -> tuple[Loop, int]:
+    """A loop that has said that a candidate begins before the next sample."""
+    loop, now_ns = watching(judged(ALIKE, 0.5, 1.0))
+    assert follows(loop, now_ns) == ("shadow", "") and loop.state.has_next
+    return loop, now_ns
+
+
+@pytest.mark.parametrize(
+    ("ends", "why"),
+    [
+        (lambda loop, now_ns: gone_back(loop, now_ns), "replaced"),
+        (lambda loop, now_ns: loop.restarted(), "interrupted"),
+        (lambda loop, now_ns: loop.give_up_one("", "failed", "no memory"), "failed"),
+        (lambda loop, now_ns: loop.model_changed([], now_ns), "by_hand"),
+    ],
+)
+def test_what_was_said_to_begin_and_does_not_ends_with_an_event(ends: Any, why: str) -> None:
+    loop, now_ns = begun()
+    assert loop.state.diagnosis is not None
+    sha256 = loop.state.diagnosis.candidate_sha256
+    found = [
+        (note.data["step"], note.data.get("why", ""), note.data.get("model_sha256")) for note in ends(loop, now_ns)
+    ]
+    assert ("end", why, sha256) in found and not loop.state.has_next
+
+
+def gone_back(loop: Loop, now_ns: int) -> list[Note]:
+    loop.state.exchange, loop.state.incoming = "back", "a" * 64
+    return loop.exchanged(now_ns, "d" * 64)
+
+
+def test_a_result_that_comes_while_another_one_waits_decides_nothing() -> None:
+    loop, now_ns = begun()
+    waits = loop.state.diagnosis
+    for found in (DiagnosisData(verdict="adequate"), DiagnosisData(verdict="explained", candidate_sha256="e" * 64)):
+        assert loop.receive(found, now_ns) == [] and loop.state.diagnosis is waits
+
+
+def test_a_warm_up_that_nothing_waits_for_does_not_end_the_diagnosis_under_way(tmp_path: Path) -> None:
+    """A person has dismissed what was warmed up; it fails after the next diagnosis has begun."""
+    core = ModelLoop(settings(), parse_model(QUILL, source="test"), {})
+    core.state.diagnosis = under_way = Running(from_utc_ns=0, to_utc_ns=1, why="misfit")
+    parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
+    loop = live.LiveLoop(settings(), parts, tmp_path, events=Mock(), journal=Mock(), clock=Mock())
+    dismissed = DiagnosisData(verdict="explained", candidate_sha256="c" * 64)
+    loop._warming = Found(Weighed(dismissed, b""), "", why="the candidate cannot be warmed up")
+    loop.hand_over(Mock())
+    assert core.state.diagnosis is under_way and loop._warming is None
 
 
 async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_the_same_of_both(tmp_path: Path) -> None:

@@ -2,14 +2,18 @@
 
 One that no other candidate surpasses: that is clearly better on the hours of both, by the rule of the verdict with the
 first one as the present model. Of several the one that shows most.
+
+One that has all effects of another one and more, and cannot be adopted yet because its level is not known, does not
+keep that one out: measured Y speaks for the further effects and not against those of both. It goes on beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
+from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.place import ADOPTION_H, is_asked, leads
 from compensator.service.loop.proof import is_clearly_better
@@ -17,7 +21,7 @@ from compensator.service.loop.state import LoopState, Place
 
 
 class Choice:
-    """Chooses a candidate.
+    """Chooses a candidate after new verdicts; two of them are compared once.
 
     Parameters
     ----------
@@ -31,32 +35,44 @@ class Choice:
 
     def __init__(self, state: LoopState, settings: LoopSettings, compared: Callable[[Place], Compared]) -> None:
         self._state, self._settings, self._compared = state, settings, compared
+        self._beside: dict[tuple[str, str], ComparisonData] = {}
 
-    def best(self, judged: Sequence[Place], now_ns: int) -> list[Place]:
-        """Return the candidates to choose from: what is proposed with a new verdict only."""
+    def beside(self, place: Place, rival: Place) -> ComparisonData:
+        """Compare a candidate with another one."""
+        pair = place.sha256, rival.sha256
+        if pair not in self._beside:
+            self._beside[pair] = self._compared(place).beside(rival)
+        return self._beside[pair]
+
+    def better(self, judged: Sequence[Place], now_ns: int) -> list[Place]:
+        """Return the candidates to choose from, the best first: what is proposed with a new verdict only."""
         asked = self._state.proposed
         if asked is not None and is_asked(asked, self._settings):
             return []
         return [
             place
             for place in sorted(self._state.candidates, key=lambda place: -place.shows)
-            if (place in judged or not place.is_proposed)
-            and self._compared(place).is_better(now_ns)
-            and not self._is_surpassed(place)
+            if (place in judged or not place.is_proposed) and self._compared(place).is_better(now_ns)
         ]
 
-    def adopted(self, best: Sequence[Place], now_ns: int) -> Place | None:
+    def adopted(self, better: Sequence[Place], now_ns: int) -> Place | None:
         """Return the one that is adopted without a person."""
         if not self._may_adopt(now_ns):
             return None
-        return next((place for place in best if self._compared(place).level_um is not None), None)
+        for place in better:
+            is_kept_out = any(not self._has_more_and_waits(one, place) for one in self._surpassing(place))
+            if not is_kept_out and self._compared(place).level_um is not None:
+                return place
+        return None
 
-    def proposed(self, best: Sequence[Place]) -> Place | None:
+    def proposed(self, better: Sequence[Place]) -> Place | None:
         """Return the one that a person is asked about, in the place of a proposed one that it surpasses."""
         before, by_hand = self._state.proposed, self._settings.policy == "propose"
-        for place in best:
+        for place in better:
             is_next = before is None or (place is not before and self._surpasses(place, before))
-            if is_next and (by_hand or self._compared(place).level_um is None):
+            if not is_next or any(self._surpassing(place)):
+                continue
+            if by_hand or self._compared(place).level_um is None:
                 return place
         return None
 
@@ -70,8 +86,12 @@ class Choice:
             return False
         return state.watched is None or not leads(state.watched.verdict, self._settings)
 
-    def _is_surpassed(self, place: Place) -> bool:
-        return any(self._surpasses(one, place) for one in self._state.candidates if one is not place)
+    def _surpassing(self, place: Place) -> Iterator[Place]:
+        return (one for one in self._state.candidates if one is not place and self._surpasses(one, place))
 
     def _surpasses(self, place: Place, rival: Place) -> bool:
-        return is_clearly_better(self._compared(place).beside(rival))
+        return is_clearly_better(self.beside(place, rival))
+
+    def _has_more_and_waits(self, one: Place, place: Place) -> bool:
+        """Return whether a candidate has all effects of another one and more, and cannot be adopted yet."""
+        return set(place.effects) < set(one.effects) and self._compared(one).level_um is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, EventKind
+from compensator.events import ComparisonData, ComparisonVerdict, EventKind
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
@@ -19,7 +19,8 @@ from compensator.service.loop.proof import (
 from compensator.service.loop.state import Place
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome
-from compensator.service.transfer.comparison import Comparison, beside
+from compensator.service.transfer.beside import beside
+from compensator.service.transfer.comparison import Comparison
 from compensator.service.transfer.second_opinion import is_unusable
 
 _HOUR_NS = 3600 * NS
@@ -81,8 +82,8 @@ class Compared:
     def judge(self) -> None:
         """Make the verdict anew.
 
-        One that has taken over is judged by all values or by its own alone, whichever show more. So it is one case more
-        by itself; in its first hours, which show nothing, it does not end as worse.
+        One that has taken over is judged by all values or, once they judge, by its own alone, whichever show more. So
+        it is one case more by itself.
         """
         place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
         cases = self._candidates + has_taken_over if place.role == "candidate" else 1
@@ -90,7 +91,8 @@ class Compared:
         place.verdict = self._comparison.verdict(deviations=wanted)
         if has_taken_over:
             own = self._comparison.of_itself().verdict(deviations=wanted)
-            place.verdict = own if (own.deviations or 0.0) > place.shows else place.verdict
+            shows_more = own.deviations is not None and own.deviations > place.shows
+            place.verdict = own if shows_more else place.verdict
 
     def add_suspected(self, other: Outcome) -> bool:
         """Begin anew, and return whether something was compared: the sensor was wrong before it was suspected."""
@@ -108,6 +110,14 @@ class Compared:
             place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
         )
         return found and (not place.comparison.model_ns or self._comparison.is_itself_better())
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the other model is worse, and in its own hours, too: one that took over has to be judged by them."""
+        place = self._place
+        if place.verdict.verdict != ComparisonVerdict.WORSE:
+            return False
+        return not place.comparison.model_ns or self._comparison.of_itself().verdict().deviations is not None
 
     @property
     def shown_level_um(self) -> float | None:

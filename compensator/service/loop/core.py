@@ -193,7 +193,7 @@ class ModelLoop:
         difference = new.status.target_um - present.status.target_um
         return difference if math.isfinite(difference) else None
 
-    def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes, Note]:
+    def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes, list[Note]]:
         """Let a model in shadow continue from the present one; that goes into shadow, or ends after a way back.
 
         Parameters
@@ -207,8 +207,8 @@ class ModelLoop:
 
         Returns
         -------
-        Compensation, bytes, Note
-            The compensation for the next sample, its model file, and the event of the exchange.
+        Compensation, bytes, list of Note
+            The compensation for the next sample, its model file, and the events: the exchange, and what ended with it.
         """
         state, incoming = self.state, self.state.place(self.state.incoming)
         assert incoming is not None
@@ -217,15 +217,15 @@ class ModelLoop:
         handover = present.status.handover
         new.compensation.raise_level(level_um)
         new.compensation.continue_from(_handed_over(present))
-        goes_on = self.loop.exchanged(now_ns, present.model.sha256)
+        ended = self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
         # What holds the published offset concerns the new one only.
         present.continue_from(replace_fields(handover, operator_hold=False, internal_error=False, probing=None))
-        if goes_on:
+        if self.state.place(present.model.sha256) is not None:
             self.shadows[present.model.sha256] = Shadow(present, data)
         self.drop_ended()
         note = _exchange_note(action, present, new.compensation, verdict, level_um)
-        return new.compensation, new.data, note
+        return new.compensation, new.data, [note, *ended]
 
     def drop_ended(self) -> bool:
         """Let go of what is in shadow no longer; return whether there was something."""

@@ -27,6 +27,7 @@ from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.status import loop_status
+from compensator.service.loop.storing import Storing
 from compensator.service.loop.weighing import effect_names
 from compensator.service.loop.words import named
 from compensator.service.transfer.comparison import changed
@@ -101,12 +102,11 @@ class LiveLoop:
         #: None after an internal error of the loop: it stays off until the next start.
         self._core: ModelLoop | None = parts.core
         self._candidates: tuple[Candidate, ...] = ()
-        #: The diagnosis or warm-up in progress, and what it gave; a model that is being stored, and why it was not.
+        #: The diagnosis or warm-up in progress, and what it gave.
         self._task: asyncio.Task[None] | None = None
         self._found: Found | None = None
         self._warming: Found | None = None
-        self._storing: asyncio.Task[None] | None = None
-        self._stored, self._not_stored = False, ""
+        self._storing = Storing(parts.store, clock)
 
     @property
     def is_exchanging(self) -> bool:
@@ -116,7 +116,7 @@ class LiveLoop:
     @property
     def is_working(self) -> bool:
         """Whether a diagnosis, a warm-up or the storing of a model is in progress."""
-        return self._task is not None or self._storing is not None
+        return self._task is not None or self._storing.is_working
 
     def opening(self) -> Mapping[str, bytes]:
         """Return what a recording that starts with the next sample begins with."""
@@ -141,13 +141,13 @@ class LiveLoop:
         warmed = self._warming
         if warmed is not None and core.is_free:
             self._begin_shadow(core, warmed)
-        if not (core.state.exchange and self._stored):
+        if not (core.state.exchange and self._storing.is_done):
             return present
-        new, self._model, note = core.exchange(present, self._model, present.status.time_utc_ns)
-        self._stored = False
+        new, self._model, notes = core.exchange(present, self._model, present.status.time_utc_ns)
+        self._storing.is_done = False
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
-        self._events.note(*note)
+        self._note(notes)
         return new
 
     def _begin_shadow(self, core: ModelLoop, warmed: Found) -> None:
@@ -175,11 +175,15 @@ class LiveLoop:
                 self._task = asyncio.create_task(self._warm_up(found, found.weighed.candidate))
         if self._warming is not None:
             self._weigh(core, self._warming)
-        if self._not_stored:
+        if self._storing.refused:
             self._end_not_stored(core)
 
     def _weigh(self, core: ModelLoop, warming: Found) -> None:
-        """Let the loop decide about what is warmed up."""
+        """Let the loop decide about what is warmed up, if it still waits for that."""
+        running = core.state.diagnosis
+        if running is None or running.candidate_sha256 != warming.weighed.data.candidate_sha256:
+            self._warming = None
+            return
         ready = warming.catch_up()
         if warming.why:
             self._end_one(core, "", warming.why)
@@ -297,9 +301,9 @@ class LiveLoop:
             return again(core) if again is not None else otherwise
         except Exception:
             log.exception("internal error of the loop; it is off until the next start")
-        stored = self._stored
+        stored = self._storing.is_done
         self._cancel()
-        self._core, self._stored = None, stored
+        self._core, self._storing.is_done = None, stored
         self._journal.start_new_file()
         self._events.note(*_failed(f"{why}; the loop is off until the next start"))
         return otherwise
@@ -309,16 +313,17 @@ class LiveLoop:
         core = self._core
         if self._warming is not None:
             self._warming.since.append(outcome)
-        if self._stored and self._storing is None and not self.is_exchanging:
+        storing = self._storing
+        if storing.is_done and not (storing.is_working or self.is_exchanging):
             # An exchange that a defect has ended: the next start must find the model that goes on.
-            self._storing = asyncio.create_task(self._store_present())
+            storing.begin_again(self._model, model_of(self._config, self._model, source="present model").name)
         if core is None:
             return
         wanted = core.loop.wanted
         if wanted is not None and self._task is None and self._found is None:
             self._task = asyncio.create_task(self._make_diagnosis(core))
-        if core.state.exchange and self._storing is None and not self._stored:
-            self._storing = asyncio.create_task(self._store_model(core))
+        if core.state.exchange and not (storing.is_working or storing.is_done):
+            storing.begin(core)
 
     def status(self) -> LoopStatus | None:
         """Return how the loop is, for `thermal/status`; None if it is off."""
@@ -326,9 +331,8 @@ class LiveLoop:
 
     async def end(self) -> None:
         """End what is in progress: a diagnosis is begun again at the next start, a stored model is used then."""
-        task, storing = self._task, self._storing
-        if storing is not None:
-            await asyncio.gather(storing, return_exceptions=True)
+        task = self._task
+        await self._storing.end()
         self._cancel()
         if task is not None:
             await asyncio.gather(task, return_exceptions=True)
@@ -343,41 +347,11 @@ class LiveLoop:
         await found.warm_up(self._recordings, self._config, data)
         self._task = None
 
-    async def _store_model(self, core: ModelLoop) -> None:
-        """Store the model in shadow for the next start; then it is used from the next sample on."""
-        action, shadow = core.state.exchange, core.incoming
-        assert shadow is not None
-        model, now_ns = shadow.compensation.model, self._clock.utc_ns()
-
-        def store() -> None:
-            if action == "back" and self._store.has_before(model.sha256):
-                self._store.back(name=model.name, time_utc_ns=now_ns, by_loop=True)
-            else:
-                self._store.adopt(shadow.data, name=model.name, time_utc_ns=now_ns, by_loop=True)
-
-        try:
-            await asyncio.to_thread(store)
-            self._stored = True
-        except ServiceError as error:
-            self._not_stored = str(error)
-        self._storing = None
-
-    async def _store_present(self) -> None:
-        """Store the present model again, after another one was stored that has not replaced it."""
-        name, now_ns = model_of(self._config, self._model, source="present model").name, self._clock.utc_ns()
-        self._stored = False
-        try:
-            await asyncio.to_thread(self._store.adopt, self._model, name=name, time_utc_ns=now_ns, by_loop=True)
-        except ServiceError as error:
-            log.error("the next start uses another model: %s", error)
-        self._storing = None
-
     def _cancel(self) -> None:
-        for task in (self._task, self._storing):
-            if task is not None:
-                task.cancel()
-        self._task = self._storing = self._found = self._warming = None
-        self._stored, self._not_stored = False, ""
+        if self._task is not None:
+            self._task.cancel()
+        self._task = self._found = self._warming = None
+        self._storing.cancel()
 
     def _give_up(self, core: ModelLoop, why: str) -> None:
         """End everything in shadow."""
@@ -392,7 +366,7 @@ class LiveLoop:
         self._note(ended or [_failed(why)])
 
     def _end_not_stored(self, core: ModelLoop) -> None:
-        why, self._not_stored = self._not_stored, ""
+        why, self._storing.refused = self._storing.refused, ""
         incoming = core.incoming
         if incoming is None or core.state.exchange == "back":
             # The way back stays open: the model is stored again with the next sample.

@@ -17,13 +17,14 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
-from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
+from compensator.events import ComparisonVerdict, DiagnosisData, LoopAction, Note
+from compensator.service.loop.avoided import avoid
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
+from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
+from compensator.service.loop.exchanging import decide_exchange, exchanged
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import (
-    ADOPTION_H,
     falls,
     gives_way,
     is_asked,
@@ -34,9 +35,9 @@ from compensator.service.loop.place import (
 from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Exchange, LoopState, Place
+from compensator.service.loop.state import LoopState, Place
 from compensator.service.loop.trust import all_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
-from compensator.service.loop.words import begins, ended, named, nothing_follows, surpassed
+from compensator.service.loop.words import begins, named, nothing_follows, surpassed
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN
 from compensator.service.transfer.second_opinion import described, is_unusable
@@ -123,12 +124,12 @@ class Loop:
             if not suspected:
                 judged += [place] if compared.add(present, other) else []
             elif compared.add_suspected(other) and place.is_proposed and not state.exchange:
-                notes += self._withdraw(place, "a sensor is suspected, so what was compared does not count")
+                notes += withdraw(self.state, place, "a sensor is suspected, so what was compared does not count")
         for place in state.taken:
             # Until what is warmed up has its place, before the next sample, nothing that was found decides.
             if not state.exchange and (place is state.watched or not state.has_next):
                 notes += self._decide(place, now_ns, present, others[place.sha256], is_judged=place in judged)
-        if not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
+        if judged and not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
             notes += self._choose(judged, now_ns)
         return notes + self._schedule(now_ns)
 
@@ -138,96 +139,53 @@ class Loop:
         """Decide about one model: whether it ends, a proposal falls, or the service goes back to it."""
         is_candidate, verdict = place.role == "candidate", place.verdict.verdict
         if is_candidate and is_limited(other) and not is_limited(present):
-            return self._end(place, "limits")
+            return end(self.state, place, "limits")
         if now_ns - place.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
             unshown = "no_answer" if place.is_proposed else "no_difference"
-            return self._end(place, unshown if is_candidate else "watched")
+            return end(self.state, place, unshown if is_candidate else "watched")
         if self.state.clean_min < CLEAN_MIN or not is_judged:
             return []
         if not is_candidate:
             return self._go_back(place) if verdict == ComparisonVerdict.BETTER else []
-        if verdict == ComparisonVerdict.WORSE:
-            return self._end(place, "worse")
+        if self.compared(place).is_worse:
+            return end(self.state, place, "worse")
         if place.is_proposed and falls(place.verdict, self._settings):
-            return self._withdraw(place, described(place.verdict))
+            return withdraw(self.state, place, described(place.verdict))
         return []
 
     def _choose(self, judged: Sequence[Place], now_ns: int) -> list[Note]:
-        """Adopt or propose a candidate."""
+        """Adopt or propose a candidate, after new verdicts: nothing else changes what is chosen."""
         choice = Choice(self.state, self._settings, self.compared)
-        best = choice.best(judged, now_ns)
-        adopted = choice.adopted(best, now_ns)
+        better = choice.better(judged, now_ns)
+        adopted = choice.adopted(better, now_ns)
         if adopted is not None:
             return self._adopt(adopted)
-        proposed = choice.proposed(best)
-        return self._propose(proposed) if proposed is not None else []
+        proposed = choice.proposed(better)
+        return self._propose(proposed, choice) if proposed is not None else []
 
     def _adopt(self, place: Place) -> list[Note]:
-        notes = self._exchange("adopt", place)
+        notes = decide_exchange(self.state, "adopt", place, self.compared)
         text = f"a better model is adopted: {_named(place)}; {described(place.verdict)}"
         if self.state.level_um:
             text += f"; its level is raised by {self.state.level_um:+.1f} µm to that of measured Y"
-        return [*notes, self._note(place, LoopAction.ADOPT, text)]
+        return [*notes, note_of(self.state, place, LoopAction.ADOPT, text)]
 
-    def _propose(self, place: Place) -> list[Note]:
+    def _propose(self, place: Place, choice: Choice) -> list[Note]:
         """Propose a candidate, in the place of one that is proposed already."""
         notes, before = [], self.state.proposed
         if before is not None:
-            beside = self.compared(place).beside(before)
-            notes = self._withdraw(before, surpassed(place.effects, beside), why="surpassed", comparison=beside)
+            beside = choice.beside(place, before)
+            notes = withdraw(self.state, before, surpassed(place.effects, beside), why="surpassed", comparison=beside)
         place.is_proposed = True
         text = f"a better model is proposed: {_named(place)}; {described(place.verdict)}"
         if self.compared(place).level_um is None:
             text += "; its level is not confirmed: set a zero, and adopt it then"
-        return [*notes, self._note(place, LoopAction.PROPOSE, text)]
-
-    def _withdraw(
-        self, place: Place, text: str, *, why: str = "", comparison: ComparisonData | None = None
-    ) -> list[Note]:
-        place.is_proposed = False
-        text = f"the proposal is withdrawn: {text}"
-        return [self._note(place, LoopAction.WITHDRAW, text, why=why, comparison=comparison)]
+        return [*notes, note_of(self.state, place, LoopAction.PROPOSE, text)]
 
     def _go_back(self, place: Place) -> list[Note]:
-        notes = self._exchange("back", place)
+        notes = decide_exchange(self.state, "back", place, self.compared)
         text = f"back to the model before, which is better: {_named(place)}; {described(place.verdict)}"
-        return [*notes, self._note(place, LoopAction.BACK, text)]
-
-    def _exchange(self, action: Exchange, place: Place) -> list[Note]:
-        """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
-        state, compared, proposed = self.state, self.compared(place), self.state.proposed
-        notes = []
-        if proposed is not None and proposed is not place:
-            notes = self._withdraw(proposed, "another model replaces the present one")
-        state.exchange, state.incoming = action, place.sha256
-        state.level_um = compared.level_at_adoption_um if action == "adopt" else compared.unknown_level_um
-        if action == "adopt" and compared.shown_level_um is not None:
-            place.verdict = msgspec.structs.replace(place.verdict, y_moved=False)  # the effect has moved it
-        return notes
-
-    def _end(self, place: Place, why: str, text: str = "") -> list[Note]:
-        """End a shadow, and an exchange with it."""
-        state = self.state
-        notes = [self._note(place, LoopAction.END, text or ended(why, place.verdict), why=why)]
-        state.remove(place)
-        if state.incoming == place.sha256:
-            state.exchange, state.incoming = "", ""
-        return notes
-
-    def _note(
-        self, place: Place, step: LoopAction, text: str, why: str = "", comparison: ComparisonData | None = None
-    ) -> Note:
-        data = LoopData(
-            step=step,
-            why=why,
-            role=place.role,
-            model_sha256=place.sha256,
-            effects=place.effects,
-            since_utc_ns=place.since_utc_ns,
-            comparison=comparison if comparison is not None else place.verdict,
-            level_um=self.state.level_um if self.state.exchange else None,
-        )
-        return Note(EventKind.LOOP, text, data.table())
+        return [*notes, note_of(self.state, place, LoopAction.BACK, text)]
 
     # ------------------------------------------------------------------ diagnoses
 
@@ -241,10 +199,10 @@ class Loop:
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up, and begins."""
-        state = self.state
-        running, state.diagnosis = state.diagnosis, None
-        if running is None:
-            return []
+        state, running = self.state, self.state.diagnosis
+        if running is None or running.candidate_sha256:
+            return []  # what another one has found is warmed up, or begins
+        state.diagnosis = None
         why = why_nothing(state, self._settings, found, now_ns)
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
@@ -263,11 +221,11 @@ class Loop:
         if before is not None and is_asked(before, self._settings):
             state.diagnosis = None
             return [nothing_follows("in_shadow", found)]
-        last = gives_way(state) if before is None else None
-        notes = self._end(last, "gives_way") if last is not None else []
+        last = gives_way(state, self._settings) if before is None else None
+        notes = end(self.state, last, "gives_way") if last is not None else []
         if before is not None and before.is_proposed:
             text = "newer parameters of the same effects take over, and are proposed once their own hours show it"
-            notes += self._withdraw(before, text, why="taken_over")
+            notes += withdraw(self.state, before, text, why="taken_over")
         state.diagnosis = msgspec.structs.replace(running, is_next=True)
         return [*notes, begins(found)]
 
@@ -291,41 +249,9 @@ class Loop:
             state.remove(before)
         state.found, state.diagnosis = [*state.found, place], None
 
-    def exchanged(self, now_ns: int, sha256_before: str) -> bool:
-        """Go on after a model in shadow has replaced the present one, whose hash was `sha256_before`.
-
-        Returns
-        -------
-        bool
-            Whether the model that was replaced goes on in shadow.
-        """
-        state, back, level_um = self.state, self.state.exchange == "back", self.state.level_um
-        incoming = state.place(state.incoming)
-        assert incoming is not None
-        before, state.effects, state.exchange, state.incoming = state.effects, incoming.effects, "", ""
-        state.error.clear()
-        state.remove(incoming)
-        if state.diagnosis is not None and state.diagnosis.candidate_sha256:
-            state.diagnosis = None  # a candidate that is warmed up was weighed beside the model that has gone
-        for place in state.found:
-            self.compared(place).go_on_beside(incoming, level_um)
-        if back:
-            avoid_after_back(state, before, now_ns, first_h=ADOPTION_H, longest_h=self._settings.watch_h)
-            state.watched = None
-            others = [place for place in state.found if place.sha256 != incoming.sha256]
-            state.found = [place for place in others if not is_avoided(state, place.effects, now_ns)]
-            return False
-        state.adopted_utc_ns = now_ns
-        outgoing = Place(sha256=sha256_before, effects=before, role="before", since_utc_ns=now_ns)
-        watched = state.watched
-        if watched is not None and sorted(before) == sorted(incoming.effects):
-            # Other parameters of the same effects end with the same effect: it stays the way back.
-            watched.begin_anew()
-            watched.since_utc_ns = now_ns
-            state.found = [*state.found, outgoing]
-        else:
-            state.watched = outgoing
-        return True
+    def exchanged(self, now_ns: int, sha256_before: str) -> list[Note]:
+        """Go on after a model in shadow has replaced the present one; see `exchanging.exchanged`."""
+        return exchanged(self.state, self._settings, now_ns, sha256_before, self.compared)
 
     def accept(self, sha256: str = "") -> list[Note]:
         """Adopt the candidate before the next sample: an operator has agreed.
@@ -343,9 +269,9 @@ class Loop:
         candidate = self._meant(sha256, "adopt --candidate")
         if self.state.exchange:
             return []
-        notes = self._exchange("adopt", candidate)
+        notes = decide_exchange(self.state, "adopt", candidate, self.compared)
         text = f"an operator adopts the candidate: {_named(candidate)}; {described(candidate.verdict)}"
-        return [*notes, self._note(candidate, LoopAction.ADOPT, text, why="by_hand")]
+        return [*notes, note_of(self.state, candidate, LoopAction.ADOPT, text, why="by_hand")]
 
     def dismiss(self, now_ns: int, sha256: str = "") -> list[Note]:
         """End a candidate: an operator has refused it. Its effects are avoided for some time.
@@ -359,10 +285,10 @@ class Loop:
         if self.state.exchange:
             return []
         avoid(self.state, candidate.effects, now_ns, self._settings.watch_h)
-        running = self.state.diagnosis
+        running, notes = self.state.diagnosis, end(self.state, candidate, "dismissed")
         if running is not None and running.found is not None and running.found.effects == candidate.effects:
-            self.state.diagnosis = None  # newer parameters of them are warmed up: they are refused, too
-        return self._end(candidate, "dismissed")
+            notes += end_diagnosis(self.state, "dismissed")  # newer parameters of them are refused, too
+        return notes
 
     def _meant(self, sha256: str, command: str) -> Place:
         """Return the candidate that an operator's answer is about."""
@@ -388,14 +314,14 @@ class Loop:
 
     def give_up(self, why: str, text: str) -> list[Note]:
         """End everything that is in shadow, and a diagnosis, for a cause outside of the loop."""
-        self.state.diagnosis = None
-        return [note for place in self.state.taken for note in self._end(place, why, text)]
+        notes = [note for place in self.state.taken for note in end(self.state, place, why, text)]
+        return notes + end_diagnosis(self.state, why, text)
 
     def give_up_one(self, sha256: str, why: str, text: str) -> list[Note]:
         """End a diagnosis, and the shadow with this hash if there is one, for a cause outside of the loop."""
-        self.state.diagnosis = None
         place = self.state.place(sha256)
-        return self._end(place, why, text) if place is not None else []
+        notes = end(self.state, place, why, text) if place is not None else []
+        return notes + end_diagnosis(self.state, why, text)
 
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""

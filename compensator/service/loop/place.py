@@ -1,8 +1,8 @@
 """Which models run in shadow beside the present one, and what follows from a diagnosis.
 
 What a diagnosis has found takes a free place; with the effects of a candidate it takes over what that one has shown.
-Where all places are taken the model that shows least gives way. The model before an adoption has a place of its own for
-as long as it is watched: the way back does not depend on what is found meanwhile.
+Where all places are taken the model that promises least gives way. The model before an adoption has a place of its own
+for as long as it is watched: the way back does not depend on what is found meanwhile.
 """
 
 from __future__ import annotations
@@ -68,14 +68,18 @@ def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place 
     return alike[0] if alike and role == "candidate" and not state.exchange else None
 
 
-def gives_way(state: LoopState) -> Place | None:
-    """Return the model that gives its place to a newcomer with other effects: that shows least; None if one is free.
+def gives_way(state: LoopState, settings: LoopSettings) -> Place | None:
+    """Return the model that gives its place to a newcomer with other effects; None if a place is free.
 
-    What is proposed stays.
+    It is the one with the least log likelihood ratio for each hour of evidence (`Place.promise`), of those that have
+    been judged for `shadow_h`: before that it is noise. Only where none has, of all. What is proposed stays.
     """
     if len(state.found) < CANDIDATES:
         return None
-    return min((place for place in state.found if not place.is_proposed), key=lambda place: place.shows)
+    return min(
+        (place for place in state.found if not place.is_proposed),
+        key=lambda place: (place.verdict.hours < settings.shadow_h, place.promise),
+    )
 
 
 def is_asked(candidate: Place, settings: LoopSettings) -> bool:

@@ -65,7 +65,7 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
             resumed.notes += core.loop.restarted()
             return core
         if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
-            resumed.notes.append(_complete(resumed, last))
+            resumed.notes += _complete(resumed, last)
             return core
     core.drop_ended()
     notes: list[Note] = core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
@@ -74,11 +74,11 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     return ModelLoop(config, present.model, core.attachments())
 
 
-def _complete(resumed: Resumed, last: _Replayed) -> Note:
+def _complete(resumed: Resumed, last: _Replayed) -> list[Note]:
     """Complete an exchange whose model is stored already."""
     old = last.compensation
-    resumed.compensation, _, note = last.loop.core.exchange(old, last.model, old.status.time_utc_ns)
-    return note
+    resumed.compensation, _, notes = last.loop.core.exchange(old, last.model, old.status.time_utc_ns)
+    return notes
 
 
 def _replayed(config: Config, folder: Path) -> _Replayed | None:

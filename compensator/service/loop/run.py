@@ -200,7 +200,7 @@ class LoopRun:
         core, notes, self._notes = self._core, self._notes, []
         core.drop_ended()
         if core.state.exchange:
-            notes.append(self._exchange(now_ns))
+            notes += self._exchange(now_ns)
         found, self._found = self._found, None
         if found is not None:
             weighed = core.weigh(found, calibrated=self._calibrated)
@@ -216,9 +216,9 @@ class LoopRun:
                     core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data), error)
         return notes
 
-    def _exchange(self, now_ns: int) -> Note:
-        self._compensation, self._data, note = self._core.exchange(self._compensation, self._data, now_ns)
-        return note
+    def _exchange(self, now_ns: int) -> list[Note]:
+        self._compensation, self._data, notes = self._core.exchange(self._compensation, self._data, now_ns)
+        return notes
 
     def _diagnosed(self, record: Sequence[Outcome]) -> Diagnosed:
         try:

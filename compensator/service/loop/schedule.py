@@ -5,6 +5,7 @@ from __future__ import annotations
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.ending import end_diagnosis
 from compensator.service.loop.state import LoopState, Running
 
 _HOUR_NS = 3600 * NS
@@ -39,18 +40,17 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
 
 def begin_again(state: LoopState) -> list[Note]:
     """Begin a diagnosis once more that the end of the service has interrupted."""
-    running = state.diagnosis
+    running, notes = state.diagnosis, end_diagnosis(state, "interrupted")
     if running is None:
         return []
     if running.attempts > 1:
-        state.diagnosis = None
         data = LoopData(step=LoopAction.END, why="interrupted")
         text = "a diagnosis was interrupted twice: the next one is made when it is planned"
-        return [Note(EventKind.LOOP, text, data.table())]
+        return [*notes, Note(EventKind.LOOP, text, data.table())]
     state.diagnosis = Running(
         from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why="again", attempts=running.attempts + 1
     )
-    return [_begins(state.diagnosis)]
+    return [*notes, _begins(state.diagnosis)]
 
 
 def _begins(running: Running) -> Note:

@@ -81,6 +81,11 @@ class Place(msgspec.Struct, kw_only=True):
         """How strongly measured Y speaks for it so far, standard deviations; 0 while there is too little."""
         return self.verdict.deviations or 0.0
 
+    @property
+    def promise(self) -> float:
+        """How much measured Y speaks for it in each hour so far, 2 log L / h; a right one's L grows with the hours."""
+        return self.shows * abs(self.shows) / self.verdict.hours if self.verdict.hours > 0.0 else 0.0
+
 
 class Avoided(msgspec.Struct, frozen=True, kw_only=True):
     """Effects that are not adopted again before a time."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from compensator.events import ComparisonData, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.place import role_of
+from compensator.service.loop.state import NO_VERDICT
 from compensator.service.transfer.second_opinion import described
 
 
@@ -41,16 +42,24 @@ def surpassed(effects: Sequence[str], beside: ComparisonData) -> str:
     )
 
 
-def ended(why: str, verdict: ComparisonData) -> str:
+def does_not_begin(effects: Sequence[str], why: str) -> str:
+    """Return that what was said to begin does not."""
+    return f"{named(effects)} is not compared: {why}"
+
+
+def ended(why: str, verdict: ComparisonData = NO_VERDICT) -> str:
     """Return why a shadow has ended."""
     return {
         "limits": "the candidate reaches limits that the present model keeps",
         "worse": f"the candidate is worse: {described(verdict)}",
         "no_answer": f"nobody answered the proposal: {described(verdict)}",
-        "gives_way": f"the place is needed, and this one shows least: {described(verdict)}",
+        "gives_way": f"the place is needed, and this one promises least: {described(verdict)}",
         "no_difference": f"the candidate shows no clear difference: {described(verdict)}",
         "watched": f"the model before is no longer compared: {described(verdict)}",
         "dismissed": "the candidate is dismissed by an operator",
+        "avoided": "the service goes back from the effects of the candidate",
+        "replaced": "another model has replaced the present one",
+        "interrupted": "the service was interrupted before it began",
     }[why]
 
 

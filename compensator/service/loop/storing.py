@@ -1,0 +1,89 @@
+"""Stores the models of the loop's exchanges for the next start, as a task beside the samples."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from compensator.clock import Clock
+from compensator.errors import ServiceError
+from compensator.service.loop.core import ModelLoop
+from compensator.service.transfer.model_store import ModelStore
+
+log = logging.getLogger("compensator")
+
+
+class Storing:
+    """One model at a time; used in the service's loop only.
+
+    Parameters
+    ----------
+    store : ModelStore
+        Adopted models.
+    clock : Clock
+        Of the service.
+    """
+
+    def __init__(self, store: ModelStore, clock: Clock) -> None:
+        self._store, self._clock = store, clock
+        self._task: asyncio.Task[None] | None = None
+        #: Whether the model of a decided exchange is stored, and why it was not.
+        self.is_done = False
+        self.refused = ""
+
+    @property
+    def is_working(self) -> bool:
+        """Whether a model is being stored."""
+        return self._task is not None
+
+    def begin(self, core: ModelLoop) -> None:
+        """Store the model in shadow that replaces the present one; then it is used from the next sample on."""
+        action, shadow = core.state.exchange, core.incoming
+        assert shadow is not None
+        model, now_ns = shadow.compensation.model, self._clock.utc_ns()
+
+        def store() -> None:
+            if action == "back" and self._store.has_before(model.sha256):
+                self._store.back(name=model.name, time_utc_ns=now_ns, by_loop=True)
+            else:
+                self._store.adopt(shadow.data, name=model.name, time_utc_ns=now_ns, by_loop=True)
+
+        self._task = asyncio.create_task(self._store_model(store))
+
+    def begin_again(self, model: bytes, name: str) -> None:
+        """Store the present model again, after another one was stored that has not replaced it."""
+        self.is_done = False
+        now_ns = self._clock.utc_ns()
+
+        def store() -> None:
+            self._store.adopt(model, name=name, time_utc_ns=now_ns, by_loop=True)
+
+        self._task = asyncio.create_task(self._store_present(store))
+
+    def cancel(self) -> None:
+        """Forget what is being stored, and what was."""
+        if self._task is not None:
+            self._task.cancel()
+        self._task = None
+        self.is_done, self.refused = False, ""
+
+    async def end(self) -> None:
+        """Wait for what is being stored."""
+        if self._task is not None:
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def _store_model(self, store: Callable[[], None]) -> None:
+        try:
+            await asyncio.to_thread(store)
+            self.is_done = True
+        except ServiceError as error:
+            self.refused = str(error)
+        self._task = None
+
+    async def _store_present(self, store: Callable[[], None]) -> None:
+        try:
+            await asyncio.to_thread(store)
+        except ServiceError as error:
+            log.error("the next start uses another model: %s", error)
+        self._task = None
