@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from compensator.api.axis_results import PagedAxes
 from compensator.api.files import ModelLike, Paged, models_of, write_curves
 from compensator.arrays import Vector
@@ -19,8 +17,7 @@ from compensator.axes import AxisWords
 from compensator.blas import one_thread
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
 from compensator.data.frames import frame_of
-from compensator.data.measurement import DataLike, Measurement, check_each_once, measurements, runs_in
-from compensator.data.screening import check_deformation_scale, screen_temperatures
+from compensator.data.measurement import DataLike, Measurement, check_each_once, measurements, screened_runs_in
 from compensator.display import Table
 from compensator.errors import DataError, ModelError, UsageError
 from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
@@ -258,9 +255,7 @@ def _compare(
     """Compare the models of one axis on its data."""
     period_s = next(iter(found.values())).period_s
     for one in measured:
-        screened, _ = runs_in([one], period_s)
-        screen_temperatures(one.label, screened, quiet_air=True)
-        check_deformation_scale(one.label, np.concatenate([run.y_um for run in screened]))
+        screened_runs_in([one], period_s)
     runs = free_runs(found, measured, from_h=from_h)
     if runs.samples < 2:
         count = "only one" if runs.samples else "no"

@@ -23,13 +23,20 @@ from compensator.axes import AxisWords, column_of, label_of
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
-from compensator.data.measurement import DataLike, Measurement, check_each_once, check_validation, measurements, runs_in
-from compensator.data.screening import check_deformation_scale, require_y_noise, screen_temperatures
+from compensator.data.measurement import (
+    DataLike,
+    Measurement,
+    check_each_once,
+    check_validation,
+    measurements,
+    name_of,
+    screened_runs_in,
+)
+from compensator.data.screening import require_y_noise
 from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
-from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.series import series_of
 from compensator.diagnose.standing import verdict_of
@@ -371,15 +378,15 @@ def _diagnosed(
 ) -> DiagnosisResult:
     """Diagnose the model of an axis on its data."""
     measured = list(whole) if fit_until_h is None else [one.before(fit_until_h) for one in whole]
-    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um, check=partial(require_channels, base))
-    name = ", ".join(dict.fromkeys(run.name for run in runs))
-    screen_temperatures(name, runs, quiet_air=True)
-    require_y_noise(name, runs)
-    remarks += no_causes(name, runs).values()
-    check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
+    screened = partial(
+        screened_runs_in, period_s=base.period_s, y_std_um=y_std_um, check=partial(require_channels, base)
+    )
+    runs, remarks = screened(measured)
+    require_y_noise(name_of(runs), runs)
     for one in validation:  # refused before the search, which may take minutes
-        FreeRunErrors.of({BASE: base}, [one], HELD_OUT)
+        remarks += screened([one])[1]
     found = find_effects(base, runs, expected=expected, progress=progress, executor_map=executor_map)
+    remarks += found.evidence.no_causes.values()
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)

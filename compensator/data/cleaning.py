@@ -38,17 +38,17 @@ _UNITS = {"K": (1.0, 273.15), "°F": (1.8, 32.0)}
 
 @dataclass(frozen=True, slots=True)
 class Stand:
-    """Where a channel stands at the end of its range.
+    """Where a channel stands at an end of its range, or at both.
 
     Parameters
     ----------
-    limit : float
-        The value.
+    limits : tuple of float
+        The value, or both.
     mask : numpy.ndarray of bool, shape (n,)
         The samples.
     """
 
-    limit: float
+    limits: tuple[float, ...]
     mask: Mask
 
     def in_words(self, column: str, t_s: Vector) -> str:
@@ -56,8 +56,9 @@ class Stand:
         first = int(np.argmax(self.mask))
         last = first + int(np.argmin(np.append(self.mask[first:], False))) - 1
         count, share = int(self.mask.sum()), 100.0 * float(np.mean(self.mask))
+        values, end = " or ".join(f"{limit:g}" for limit in self.limits), "end" if len(self.limits) == 1 else "ends"
         return (
-            f"{column} stands at exactly {self.limit:g}, the end of what it shows, in {count} of {self.mask.size} "
+            f"{column} stands at exactly {values}, the {end} of what it shows, in {count} of {self.mask.size} "
             f"samples ({share:.0f} %), first from t_s = {t_s[first]:g} to {t_s[last]:g}"
         )
 
@@ -197,7 +198,7 @@ def _is_switched_at_start(columns: Mapping[str, Vector]) -> bool:
 
 
 def stand_at_limit(values: Vector) -> Stand | None:
-    """Return where a channel stands at the end of its range, if it does.
+    """Return where a channel stands at an end of its range, or at both, if it does.
 
     There it is exactly one value, its largest or smallest, for many samples, and comes and leaves with a slope, while
     it is noisy elsewhere. A converter of coarse steps has such stands at every level, a machine at rest comes to its
@@ -212,21 +213,30 @@ def stand_at_limit(values: Vector) -> Stand | None:
     v = values[known]
     if v.size < STANDS_SAMPLES + DEAD_SAMPLES or np.ptp(v) == 0.0:
         return None
-    for limit in (float(v.max()), float(v.min())):
-        at = np.abs(v - limit) <= SAME * max(1.0, abs(limit))
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0]))))
-        long = [
-            (a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= STAND_SAMPLES
-        ]
-        if sum(b - a for a, b in long) >= STANDS_SAMPLES and _is_lively(v, at) and _is_cut_off(v, at, long):
-            mask = np.zeros(values.size, dtype=bool)
-            mask[known[at]] = True
-            return Stand(limit, mask)
-    return None
+    ends = [(limit, *_stands(v, limit)) for limit in sorted({float(v.min()), float(v.max())})]
+    ends = [(limit, at, long) for limit, at, long in ends if sum(b - a for a, b in long) >= STANDS_SAMPLES]
+    # A signal that is cut off on both sides is lively between them.
+    within = np.logical_or.reduce([at for _, at, _ in ends]) if ends else np.zeros(v.size, dtype=bool)
+    if not ends or not _is_lively(v, within):
+        return None
+    if not any(_is_cut_off(v, within, long) for _, _, long in ends):
+        return None
+    # It may come to the other end more slowly than usual, as a machine does that comes to rest below it.
+    found = [(limit, at) for limit, at, long in ends if _is_cut_off(v, within, long, also=True)]
+    mask = np.zeros(values.size, dtype=bool)
+    mask[known[np.logical_or.reduce([at for _, at in found])]] = True
+    return Stand(tuple(limit for limit, _ in found), mask)
+
+
+def _stands(v: Vector, limit: float) -> tuple[Mask, list[tuple[int, int]]]:
+    """Return where a signal is at a limit, and first and past last sample of each time that it stands there."""
+    at = np.abs(v - limit) <= SAME * max(1.0, abs(limit))
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0])))).tolist()
+    return at, [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STAND_SAMPLES]
 
 
 def _is_lively(v: Vector, at: Mask) -> bool:
-    """Whether a signal is noisy, in steps finer than its noise, where it is not at its limit."""
+    """Whether a signal is noisy, in steps finer than its noise, where it is not at a limit."""
     steps = np.diff(v)[~at[1:] & ~at[:-1]]
     if steps.size < DEAD_SAMPLES:
         return False
@@ -234,14 +244,18 @@ def _is_lively(v: Vector, at: Mask) -> bool:
     return turns > LIVELY_TURNS and still < LIVELY_STILL
 
 
-def _is_cut_off(v: Vector, at: Mask, stands: Sequence[tuple[int, int]]) -> bool:
-    """Whether a signal comes to its limit, and leaves it, as steeply as it usually moves."""
-    k = SLOPE_SAMPLES
+def _is_cut_off(v: Vector, at: Mask, stands: Sequence[tuple[int, int]], *, also: bool = False) -> bool:
+    """Whether a signal comes to its limit, and leaves it, as steeply as it usually moves.
+
+    Where it is cut off at another one, `also`, it only has to come or leave faster than its noise.
+    """
+    k, noise = SLOPE_SAMPLES, 2.0 * noise_std(v)
     usual = np.abs(v[k:] - v[:-k])[~at[k:] & ~at[:-k]]
-    least = max(float(np.median(usual)) if usual.size else np.inf, 2.0 * noise_std(v))
+    least = noise if also else max(float(np.median(usual)) if usual.size else np.inf, noise)
     comes = [abs(v[a] - v[a - k]) for a, _ in stands if a >= k]
     leaves = [abs(v[b - 1 + k] - v[b - 1]) for _, b in stands if b - 1 + k < v.size]
-    return bool(comes and leaves and min(np.median(comes), np.median(leaves)) > least)
+    medians = [float(np.median(slopes)) for slopes in (comes, leaves) if slopes]
+    return len(medians) > (0 if also else 1) and min(medians) > least
 
 
 def _changed_unit(name: str, column: str, values: Vector, t_s: Vector) -> Iterator[Remark]:

@@ -21,7 +21,7 @@ from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_
 from compensator.data.gridding import to_grid
 from compensator.data.record import SampledData, SampledRecord, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
-from compensator.data.screening import check_y_std
+from compensator.data.screening import check_deformation_scale, check_y_std, screen_temperatures
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
 from compensator.input_file import read_file, sha256_of_file
@@ -357,6 +357,32 @@ def runs_in(
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
     return runs, remarks
+
+
+def screened_runs_in(
+    data: Sequence[Measurement],
+    period_s: float = PERIOD_S,
+    *,
+    y_std_um: float | None = None,
+    check: Callable[[SampledRecord, str], None] = lambda record, name: None,
+) -> tuple[list[Run], list[Remark]]:
+    """Return the runs of measurements that a model is judged by, as `runs_in`, with temperatures and Y screened.
+
+    Raises
+    ------
+    DataError
+        If a temperature cannot be true, or Y moves by no or another unit's amount.
+    """
+    runs, remarks = runs_in(data, period_s, y_std_um=y_std_um, check=check)
+    name = name_of(runs)
+    screen_temperatures(name, runs, quiet_air=True)
+    check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
+    return runs, remarks
+
+
+def name_of(runs: Sequence[Run]) -> str:
+    """Return the names of runs, each once, for messages."""
+    return ", ".join(dict.fromkeys(run.name for run in runs))
 
 
 def _without_runs(name: str, data: SampledData, period_s: float) -> str:

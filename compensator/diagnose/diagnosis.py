@@ -21,7 +21,7 @@ from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of, in_free_run, with_paths
+from compensator.diagnose.findings import Findings, findings_of, in_free_run
 from compensator.diagnose.fit import Term, fit_terms, late_term
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
@@ -30,6 +30,7 @@ from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.points import Points
+from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials

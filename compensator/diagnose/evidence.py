@@ -12,13 +12,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from compensator.arrays import Mask, Matrix, Vector
+from compensator.codes import Remark
 from compensator.data.runs import Run, noise_of
 from compensator.diagnose.base_run import (
     beginnings,
@@ -72,6 +73,8 @@ class Evidence:
         What noise and the base model's own error may leave of the samples used.
     probe_um : float
         White noise of the measured deformation, µm.
+    no_causes : mapping of str to Remark
+        Channels that cannot be a cause, each with a remark.
     free_paths : bool
         Whether nothing is known of the base's paths: the residual is then the measured deformation itself.
     expected : frozenset of Place
@@ -88,6 +91,7 @@ class Evidence:
     context: Context
     noise: NoiseTest
     probe_um: float
+    no_causes: Mapping[str, Remark]
     free_paths: bool = False
     expected: frozenset[Place] = frozenset()
 
@@ -212,7 +216,7 @@ class Evidence:
         residual = np.where(self.used, self.residual - added, 0.0)
         return dataclasses.replace(self, model=model, signals=signals, residual=residual), added
 
-    def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
+    def left(self, raw: Vector, effects: Vector, *, at_rest: bool | Sequence[bool]) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
         A run of which no sample is used has its zero from its own mean.
@@ -221,11 +225,13 @@ class Evidence:
         ----------
         raw, effects : numpy.ndarray, shape (n,)
             Residual of the base model, and what is subtracted from it, µm.
-        at_rest : bool
-            Whether only the zero of each run is unknown, and not its initial state.
+        at_rest : bool or sequence of bool
+            Whether only the zero of each run is unknown, and not its initial state; of all runs, or of each.
         """
         open_ = raw - effects
-        table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
+        is_open = np.ones((len(self.signals), self.nuisances.shape[1] // len(self.signals)), dtype=bool)
+        is_open[np.broadcast_to(at_rest, len(self.signals)), 1:] = False
+        table = self.nuisances[:, is_open.ravel()]
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         left = np.asarray(open_ - table @ coefficients)
         measured, first = np.isfinite(self.y_um), 0
@@ -271,7 +277,8 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         )
     noise_um = math.hypot(noise_floor(model, runs), late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
-    context = context_of(model, signals, no_causes(names, runs))
+    apart = no_causes(names, runs)
+    context = context_of(model, signals, apart)
     nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
     basis = basis_of(nuisances, used)
     # The noise of a value that was measured now and then is none of the calibration's.
@@ -288,4 +295,5 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         context=context,
         noise=NoiseTest(count=count, noise_um=noise_um, own_error_um=own_um, freedom=freedom),
         probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
+        no_causes=apart,
     )

@@ -15,13 +15,14 @@ from compensator.report.figure import Bar, Edges, Figure, Line
 
 #: A gap between measured values is drawn as one if it is longer than this many usual intervals between them.
 _GAP = 3.0
-#: Line colours of what is left, of what an effect removes, and of the remainder.
-_LEFT, _EFFECT, _REMAINDER = 1, 2, 3
+#: Line colours of what is left, of what an effect removes, of the remainder, and of what increases the error.
+_LEFT, _EFFECT, _REMAINDER, _INCREASE = 1, 2, 3, 0
 _NOTE = (
     "Each bar ends at the error with all effects down to it; each block is predicted by a search that did not use it. "
     "Percentages are shares of the mean square without any effect, because mean squares add and rms values do not. "
     "Where effects overlap, the upper one shows what both remove."
 )
+_INCREASED = " An orange bar, with “increased” beside it, adds to the error."
 
 
 def waterfall(diagnosis: Diagnosis) -> Figure:
@@ -39,6 +40,8 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     def add(label: str, last: float, line: int, *, hatched: bool = False) -> None:
         first = bars[-1].last
         share = _percent((last**2 - first**2) / before**2 if before else 0.0)
+        if share.startswith("+"):
+            share, line = f"{share}, increased", _INCREASE
         bars.append(Bar(label, f"{last:.2f} µm ({share})", first, last, line, hatched=hatched))
 
     for effect, step in zip(diagnosis.effects, diagnosis.steps, strict=False):
@@ -53,6 +56,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     if diagnosis.remainder is not None:
         add("remainder (explains nothing)", after, _REMAINDER, hatched=True)
         bars.append(Bar("with the remainder", f"{after:.2f} µm", 0.0, after, _LEFT))
+    note = _NOTE + _INCREASED * any(bar.line == _INCREASE for bar in bars)
     edges = [Edges(f"sensor noise, {diagnosis.noise_floor_um:.2f} µm", (diagnosis.noise_floor_um,))]
     if (ceiling := diagnosis.ceiling) is not None:
         edges.append(Edges(f"ceiling: the smallest error tried, {ceiling.least_um:.2f} µm", (ceiling.least_um,)))
@@ -62,7 +66,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
         y_label="model",
         bars=tuple(bars),
         edges=tuple(edges),
-        note=_NOTE if diagnosis.effects or diagnosis.remainder else "",
+        note=note if diagnosis.effects or diagnosis.remainder else "",
         height=1.1 + 0.5 * len(bars),
     )
 

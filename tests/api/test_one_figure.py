@@ -147,6 +147,29 @@ def test_a_wrong_unit_is_no_worse_model(folder: Path, tmp_path: Path, capfd: pyt
         assert words in refused(capfd, "compare", tmp_path / "wrong.csv", "--model", "quill")
 
 
+def test_what_is_said_of_readings_is_said_of_both_records(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """At the end of its range T_Q is refused, another channel is not used there, whatever the record is for."""
+    with (folder / "run.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    cut = tmp_path / "cut.csv"
+    common = ["--model", "quill", "--out", tmp_path / "d"]
+    for column, share in (("t_q_degc", 0.6), ("y_um", 0.6)):
+        low, high = table[column].min(), table[column].max()
+        rng = np.random.default_rng(0)
+        noisy = table[column] + rng.normal(0.0, 0.002 * (high - low), table[column].size)
+        write_table(cut, table | {column: np.minimum(noisy, low + share * (high - low))})
+        for words in (["diagnose", cut], ["diagnose", folder / "effect.csv", "--validate", cut]):
+            if column == "t_q_degc":
+                text = refused(capfd, *words, *common)
+                assert "cut.csv: t_q_degc stands at exactly" in text
+            else:
+                assert main([*map(str, [*words, *common])]) == 0
+                assert capfd.readouterr().out.count("cut.csv: y_um stands at exactly") == 1
+
+
 def test_hours_that_took_no_part_are_named(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     words = ["diagnose", folder / "effect.csv", "--model", "quill", "--out", tmp_path / "d", "--fit-until", 7]
     found = run(capfd, *words)

@@ -103,6 +103,19 @@ def test_another_channel_at_the_end_of_its_range_is_not_used_there():
     runs_in([one])
 
 
+@pytest.mark.parametrize(("low", "high"), [(10.0, 50.0), (15.0, 35.0), (5.0, 60.0)])
+def test_a_channel_that_is_cut_off_at_both_ends_is_used_at_neither(low, high):
+    table = machine()
+    table["second_um"] = np.clip(table["y_um"], low, high)
+    (one,) = measurements(table, "day")
+    data = one.at_period(60.0)
+    values = data.records[0].columns["second_um"]
+    cut = np.isin(table["second_um"], (low, high))
+    assert np.array_equal(np.isnan(values), cut) and 100 < cut.sum() < N
+    [said_of_it] = [str(remark) for remark in data.remarks]
+    assert f"exactly {low:g} or {high:g}, the ends of what it shows, in {cut.sum()} of {N}" in said_of_it
+
+
 @pytest.mark.parametrize("step", [0.1, 0.5, 1.0])
 def test_a_coarse_sensor_is_not_at_the_end_of_its_range(step):
     for seed in range(5):

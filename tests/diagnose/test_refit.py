@@ -12,7 +12,8 @@ from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.background import Background
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of, with_paths
+from compensator.diagnose.findings import findings_of
+from compensator.diagnose.refitted_paths import with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression

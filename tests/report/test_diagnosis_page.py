@@ -21,7 +21,7 @@ from compensator.display import text_of_all
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of, tone_of
 from compensator.report.drawing import svg
-from compensator.report.figure import Bar, Edges, Figure, Line
+from compensator.report.figure import Bar, Edges, Figure, Line, described
 from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import Page, Section, html_of
 from compensator.report.results import pages_in
@@ -94,8 +94,20 @@ def test_each_bar_begins_where_the_one_above_ends_and_shares_of_the_squares_add_
 def test_what_only_the_searches_found_is_a_bar_of_its_own(found: Diagnosis) -> None:
     picture = waterfall(made(found, 5.0, 2.0, 2.0, STEPS, remainder=None, ceiling=None))
     assert [bar.last for bar in picture.bars] == pytest.approx([5.0, 3.0, 1.0, 2.0, 2.0])
-    assert picture.bars[3].value == "2.00 µm (+12 %)" and "these searches" in picture.bars[3].name
+    assert picture.bars[3].value == "2.00 µm (+12 %, increased)" and "these searches" in picture.bars[3].name
     assert len(picture.edges) == 1
+
+
+def test_what_increases_the_error_has_its_own_colour_and_a_word(found: Diagnosis) -> None:
+    steps = (Step(rms_um=6.0, searches=1), Step(rms_um=1.0, searches=FOLDS))
+    picture = waterfall(made(found, 5.0, 1.0, 1.5, steps, remainder=REMAINDER, ceiling=None))
+    left, worse, better, _, remainder, _ = picture.bars
+    assert worse.line == remainder.line and worse.line not in (left.line, better.line)
+    assert [bar for bar in picture.bars if "increased" in bar.value] == [worse, remainder]
+    assert remainder.hatched and "adds to the error" in picture.note
+    assert "6.00 µm (+44 %, increased)." in described(picture)
+    fine = waterfall(made(found, 5.0, 1.0, 1.0, STEPS, remainder=None, ceiling=None))
+    assert worse.line not in {bar.line for bar in fine.bars} and "adds to" not in fine.note
 
 
 def test_nothing_found_is_one_bar(found: Diagnosis) -> None:
