@@ -11,7 +11,6 @@ from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
-from compensator.diagnose.initial_state import begin_warm
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import MOSTLY, Search, Selection
@@ -154,10 +153,9 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
 def in_free_run(found: Findings) -> tuple[float, float]:
     """Return what the base model leaves of the data in free run, and with what would be deployed, µm rms.
 
-    Without a source that no channel shows, and with nothing unknown but the zero of each run, as in service. A run that
-    may begin warm has an initial state that no model knows: what dies away there would judge an effect by whether it
-    has the other sign. It is free for both, but where paths were fitted anew, which could make it up. What depends on
-    time alone is an error of the measurement and counts neither way.
+    Without a source that no channel shows, and with nothing unknown but the zero of each run, as in service; where a
+    warm start was estimated (`with_initial_state`), with an initial state. What depends on time alone is an error of
+    the measurement and counts neither way.
     """
     evidence = found.search.evidence
     hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
@@ -170,10 +168,7 @@ def in_free_run(found: Findings) -> tuple[float, float]:
             of_time += added
     if evidence.free_paths:  # the residual is all of y
         base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
-    is_warm = [signals.initial_um is not None for signals in evidence.signals]
-    if not any(is_warm) and not evidence.free_paths and any(signals.may_begin_warm for signals in evidence.signals):
-        is_warm = begin_warm(found.selection.fit)
-    at_rest = [not warm for warm in is_warm]
+    at_rest = all(signals.initial_um is None for signals in evidence.signals)
 
     def left_um(added: Vector) -> float:
         left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]

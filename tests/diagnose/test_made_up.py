@@ -35,7 +35,7 @@ def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, explains:
         left=lambda raw, added, at_rest: raw - added,
         free_paths=False,
         is_sparse=False,
-        signals=[SimpleNamespace(y_dtf_um=7.0 * HEAT, y_tdtf_um=HEAT, initial_um=None, may_begin_warm=False)],
+        signals=[SimpleNamespace(y_dtf_um=7.0 * HEAT, y_tdtf_um=HEAT, initial_um=None)],
     )
     return SimpleNamespace(
         search=SimpleNamespace(evidence=evidence),
@@ -69,28 +69,6 @@ def test_a_remainder_in_the_place_of_effects_is_for_the_drift_too() -> None:
     found = of([("gain", 3.0 * HEAT), ("drift", -6.0 * SOURCE)], 5.0 * HEAT - 6.0 * SOURCE, explains=False)
     found.whole = 5.0 * HEAT - 6.0 * SOURCE
     assert in_free_run(found)[1] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_what_dies_away_after_a_warm_start_does_not_judge_an_effect(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The effect has the sign of what dies away: with the zero alone it would seem to increase the error."""
-    decay = 9.0 * np.exp(-np.arange(400) / 90.0)
-    effect = 5.0 * np.exp(-np.arange(400) / 130.0) + 0.5 * SOURCE
-    found = of([("gain", -effect)], decay - effect)
-    evidence, asked = found.search.evidence, []
-
-    def left(raw: np.ndarray, added: np.ndarray, *, at_rest: list[bool]) -> np.ndarray:
-        asked.append(at_rest)
-        table = np.column_stack([np.ones(400), decay])[:, : 1 if at_rest[0] else 2]
-        return raw - added - table @ np.linalg.lstsq(table, raw - added)[0]
-
-    evidence.left, evidence.signals[0].may_begin_warm = left, True
-    found.selection = SimpleNamespace(fit="effects beside an initial state")
-    for is_warm in (False, True):
-        monkeypatch.setattr(module, "begin_warm", lambda fit, is_warm=is_warm: [is_warm])
-        before_um, after_um = in_free_run(found)
-        assert (after_um < before_um) == is_warm
-    evidence.free_paths = True
-    assert in_free_run(found)[1] > 1.0 and asked[-1] == [True]
 
 
 def test_where_paths_are_free_the_base_model_is_taken_as_it_is() -> None:
