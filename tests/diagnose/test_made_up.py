@@ -14,6 +14,7 @@ from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import findings as module
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import findings_of, in_free_run
+from compensator.diagnose.held_out import held_out_of
 from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.summary import verdict
 from sim_hardware.drawn_machines.cases import _cases
@@ -100,6 +101,28 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     assert after_um > before_um and in_free_run(second)[1] < 0.5 * before_um
     assert any(not term.effect.observed for term in first.terms)
     assert [term.hypothesis.place for term in found.terms] == [("nonlinear", "DTF", "")]
+
+
+def test_all_channels_take_the_place_of_names_with_which_the_engine_is_worse_than_without() -> None:
+    # A T_Q that is called late by 4 min, in 6 h: what the engine cannot foretell of it is more than the effect.
+    machine = next(c for c in _cases(170_000) if (c.family, c.seed) == ("conduction", 170_011)).draw()
+    base = tc.identify(machine.calibration.columns).model
+    runs, _ = runs_in(measurements(machine.record.columns, "data", None), base.period_s)
+    evidence = _evidence(base, runs)
+    named, found = findings_of(evidence, by_channels=False), findings_of(evidence)
+    before_um, after_um = in_free_run(named)
+    assert named.explains and after_um > before_um
+    assert found.by_channels and not found.explains and in_free_run(found)[1] < 0.5 * before_um
+    assert [term.hypothesis.place for term in found.terms] == [term.hypothesis.place for term in named.terms]
+    # What is held out judges what would be deployed, also where the rest of the data would decide otherwise.
+    asked: list[Any] = []
+
+    def noted(search: Any, views: Any) -> Any:
+        asked.append(search.keywords["by_channels"])
+        return map(search, views)
+
+    held_out = held_out_of(found, [], lambda done, of: None, noted)
+    assert asked == [True] and np.nanmax(np.abs(held_out.whole - held_out.ceiling)) == 0.0
 
 
 def test_it_is_said_why_nothing_is_deployed() -> None:
