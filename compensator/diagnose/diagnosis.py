@@ -175,7 +175,7 @@ def _worth_deploying(
     if evidence.is_sparse:
         # Few values: chance lowers the error of no remainder by much.
         helps = whole_um < LOWERS * min(named_um, nothing_um)
-    elif late_term(found.selection.fit):
+    elif found.explains and late_term(found.selection.fit):
         helps = whole_um < LOWERS_LATE * named_um
     else:
         helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))

@@ -216,7 +216,7 @@ class Evidence:
         residual = np.where(self.used, self.residual - added, 0.0)
         return dataclasses.replace(self, model=model, signals=signals, residual=residual), added
 
-    def left(self, raw: Vector, effects: Vector, *, at_rest: bool | Sequence[bool]) -> Vector:
+    def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
         A run of which no sample is used has its zero from its own mean.
@@ -225,13 +225,11 @@ class Evidence:
         ----------
         raw, effects : numpy.ndarray, shape (n,)
             Residual of the base model, and what is subtracted from it, µm.
-        at_rest : bool or sequence of bool
-            Whether only the zero of each run is unknown, and not its initial state; of all runs, or of each.
+        at_rest : bool
+            Whether only the zero of each run is unknown, and not its initial state.
         """
         open_ = raw - effects
-        is_open = np.ones((len(self.signals), self.nuisances.shape[1] // len(self.signals)), dtype=bool)
-        is_open[np.broadcast_to(at_rest, len(self.signals)), 1:] = False
-        table = self.nuisances[:, is_open.ravel()]
+        table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         left = np.asarray(open_ - table @ coefficients)
         measured, first = np.isfinite(self.y_um), 0

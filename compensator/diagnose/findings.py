@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,6 @@ from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
-from compensator.diagnose.initial_state import begin_warm
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import MOSTLY, Search, Selection
@@ -44,12 +44,15 @@ class Findings:
     explains : bool
         Whether the named effects are deployed. Where all channels together explain the data clearly better without
         them, their names say what resembles it most, and the remainder is deployed in their place.
-    ceiling : numpy.ndarray, shape (n,)
-        What all channels together would explain without any named effect, µm.
+    channels : Regressed
+        What all channels together explain without any named effect.
     paths : numpy.ndarray, shape (n,)
         What the base's paths alone would explain, where nothing was known of them; 0 elsewhere, µm.
     refitted : Regressed or None
         The base's paths fitted together with the named effects, where nothing was known of them.
+    by_channels : bool
+        Whether it is in their place because they are worse than nothing in free run. They may be right, and the engine
+        can do nothing with them: what a late T_Q hides may be most of the effect.
     """
 
     search: Search
@@ -60,9 +63,10 @@ class Findings:
     remainder: Regressed | None
     belongs: bool
     explains: bool
-    ceiling: Vector
+    channels: Regressed
     paths: Vector
     refitted: Regressed | None
+    by_channels: bool = False
 
     @property
     def named(self) -> Vector:
@@ -73,6 +77,11 @@ class Findings:
     def own_paths(self) -> Vector:
         """What the base's paths add, fitted together with the named effects; 0 where they are kept, µm."""
         return self.refitted.added if self.refitted else np.zeros(self.ceiling.size)
+
+    @property
+    def ceiling(self) -> Vector:
+        """What all channels together explain without any named effect, µm."""
+        return self.channels.added
 
     @property
     def whole(self) -> Vector:
@@ -90,7 +99,9 @@ class Findings:
         return float(np.hypot(rest.slow_um, rest.own_um))
 
 
-def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None) -> Findings:
+def findings_of(
+    evidence: Evidence, *, unobserved: bool = True, by_channels: bool | None = None, grid: Grid | None = None
+) -> Findings:
     """Search in some evidence.
 
     Parameters
@@ -99,21 +110,43 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
         Residual and signals; nothing but the samples used takes part.
     unobserved : bool
         Whether an unobserved source is looked for.
+    by_channels : bool, optional
+        Whether all channels are in the place of names (`Findings.by_channels`); where something is held out, as over
+        all data, for what is judged is what is deployed. Without it, where they are better in free run.
     grid : Grid, optional
         That of a search over all data, where something is held out.
     """
     found = _findings_of(evidence, grid, unobserved=unobserved)
-    if evidence.is_sparse or all(term.effect.observed for term in found.terms):
+    if evidence.is_sparse:
         return found
-    before_um, after_um = in_free_run(found)
-    if after_um <= before_um:
-        return found
-    # The effects make up for the source. Channels that explain most of it alone take their place.
-    shown = _findings_of(evidence, found.search.grid, unobserved=False)
-    rms = found.search.criterion.rms
-    nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
-    is_better = in_free_run(shown)[1] < after_um
-    return shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
+    if not _is_no_worse(found) and any(not term.effect.observed for term in found.terms):
+        # The effects make up for the source. Channels that explain most of it alone take their place.
+        shown = _findings_of(evidence, found.search.grid, unobserved=False)
+        rms = found.search.criterion.rms
+        nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
+        is_better = in_free_run(shown)[1] < in_free_run(found)[1]
+        found = shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
+    if by_channels is None:
+        by_channels = _are_channels_better(found)
+    return _by_channels(found) if by_channels else found
+
+
+def _is_no_worse(found: Findings) -> bool:
+    """Return whether what would be deployed leaves no more in free run than the base model."""
+    base_um, own_um = in_free_run(found)
+    return own_um <= base_um
+
+
+def _are_channels_better(found: Findings) -> bool:
+    """Return whether the names are worse than nothing in free run, and all channels in their place are not."""
+    if not found.terms or _is_no_worse(found):
+        return False
+    nothing = _log_evidence(found.selection.before)
+    return _is_worth_deploying(found.channels, nothing, found.search.evidence) and _is_no_worse(_by_channels(found))
+
+
+def _by_channels(found: Findings) -> Findings:
+    return dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False, by_channels=True)
 
 
 def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> Findings:
@@ -122,14 +155,14 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
     fit, points = selection.fit, search.points
     nothing = np.zeros(points.count)
     background = Background(evidence)
-    ceiling = background.fitted(points, nothing, selection.before.rest)
+    channels = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
     deployed = as_deployed(fit)
     if late_term(fit):
         remainder, explains = _beside_late(deployed[2]), True
     else:
-        remainder, explains = _remainder(search, fit, background, refitted, ceiling)
+        remainder, explains = _remainder(search, fit, background, refitted, channels)
     belongs = remainder is None and _has_own_error(fit)
     if belongs:
         fit = foretelling(fit)
@@ -145,7 +178,7 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
         remainder=remainder,
         belongs=belongs,
         explains=explains,
-        ceiling=ceiling.added,
+        channels=channels,
         paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
         refitted=refitted,
     )
@@ -154,10 +187,9 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
 def in_free_run(found: Findings) -> tuple[float, float]:
     """Return what the base model leaves of the data in free run, and with what would be deployed, µm rms.
 
-    Without a source that no channel shows, and with nothing unknown but the zero of each run, as in service. A run that
-    may begin warm has an initial state that no model knows: what dies away there would judge an effect by whether it
-    has the other sign. It is free for both, but where paths were fitted anew, which could make it up. What depends on
-    time alone is an error of the measurement and counts neither way.
+    Without a source that no channel shows, and with nothing unknown but the zero of each run, as in service; where a
+    warm start was estimated (`with_initial_state`), with an initial state. What depends on time alone is an error of
+    the measurement and counts neither way.
     """
     evidence = found.search.evidence
     hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
@@ -170,10 +202,7 @@ def in_free_run(found: Findings) -> tuple[float, float]:
             of_time += added
     if evidence.free_paths:  # the residual is all of y
         base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
-    is_warm = [signals.initial_um is not None for signals in evidence.signals]
-    if not any(is_warm) and not evidence.free_paths and any(signals.may_begin_warm for signals in evidence.signals):
-        is_warm = begin_warm(found.selection.fit)
-    at_rest = [not warm for warm in is_warm]
+    at_rest = all(signals.initial_um is None for signals in evidence.signals)
 
     def left_um(added: Vector) -> float:
         left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]

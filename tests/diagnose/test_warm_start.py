@@ -11,7 +11,6 @@ from compensator.data.record import SampledRecord
 from compensator.diagnose.base_run import context_of
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.initial_state import begin_warm
 from compensator.diagnose.search import Search
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import COOLEST, EQUAL, proposals
@@ -82,36 +81,13 @@ def test_a_machine_that_was_warmed_from_rest_predicts_the_same_where_all_is_line
     assert np.max(np.abs(warmed - warmed[0] - cold + cold[0])) < 0.1
 
 
-@functools.cache
-def cooling():
-    """24 h from the moment on at which the machine cools most; the speed bends it by its square."""
-    scenario = draw("input square", 3, 2.5)
-    columns, _, _ = record([scenario], 1303, 45.0)
-    above = np.convolve(columns["t_q_degc"] - columns["at_degc"], np.ones(5) / 5.0, mode="same")
-    first = 360 + int(np.argmax(above[360:1200] - above[480:1320]))
-    return scenario, {name: values[first : first + 24 * 60] for name, values in columns.items()}
-
-
-def test_a_right_effect_on_a_machine_that_cools_is_deployed():
-    """With the zero alone unknown its own record would seem to contradict it: 5.7 instead of 4.4 µm are left."""
-    scenario, columns = cooling()
-    found = diagnose(QUILL, runs_from(columns))
-    assert [effect.place for effect in found.effects] == [scenario.place]
-    assert [effect.channel for effect in found.model.effects] == ["spindle_rpm"]
-    fresh, true, _ = record([scenario], 5303, 24.0)
-    run = runs_from(fresh)[0]
-    assert np.std(true - predict(found.model, run)) < 0.1 * np.std(true - predict(QUILL, run))
-
-
 def test_couples_that_differ_at_rest_do_not_make_a_record_warm():
     scenario = draw("nonlinear", 5, 6.0)
     columns, _, _ = record([scenario], 1305)
     columns["t_q_degc"] = columns["t_q_degc"] + 5.0
     evidence = evidence_of(QUILL, runs_from(columns))
-    assert evidence.context.begins_warm and evidence.signals[0].may_begin_warm
-    fit = Search(evidence).run().fit
-    assert begin_warm(fit) == [False]
-    terms = fit.terms
+    assert evidence.context.begins_warm
+    terms = Search(evidence).run().fit.terms
     assert [(term.hypothesis.place, term.hypothesis.rest) for term in terms] == [(scenario.place, COOLEST)]
 
 
@@ -134,19 +110,3 @@ def test_a_record_that_begins_at_rest_has_no_further_hypotheses():
     assert not evidence.context.begins_warm
     assert all(record_.begun(rest).begins_at_rest for record_ in evidence.signals for rest in (COOLEST, EQUAL))
     assert {hypothesis.rest for hypothesis in proposals(context_of(QUILL, evidence.signals))} == {COOLEST}
-
-
-def test_the_initial_state_is_free_of_the_runs_that_begin_warm_alone():
-    columns = {name: values.copy() for name, values in cooling()[1].items()}
-    for name in ("t_q_degc", "at_degc", "y_um"):
-        columns[name][600:700] = np.nan
-    evidence = evidence_of(QUILL, runs_from(columns))
-    nothing, size = np.zeros(evidence.used.size), evidence.signals[0].size
-    assert len(evidence.signals) == 2
-
-    def left(at_rest):
-        return evidence.left(evidence.residual, nothing, at_rest=at_rest)
-
-    assert left([True, True]) == pytest.approx(left(True))
-    assert left([False, True])[:size] == pytest.approx(left(False)[:size])
-    assert left([False, True])[size:] == pytest.approx(left(True)[size:])

@@ -92,7 +92,11 @@ def test_a_printed_probe_corrects_the_offset(tmp_path: Path) -> None:
         thread.start()
         stack.callback(thread.join)
         stack.callback(ended.set)
-        until(lambda: receiver.follower.alive and receiver.probe_wanted, lambda: _log(tmp_path))
+        # None was taken since the zero, so one is wanted as soon as there is a value to probe.
+        until(
+            lambda: receiver.follower.alive and receiver.probe_wanted and receiver.probe_wanted.wanted,
+            lambda: _log(tmp_path),
+        )
         session = stack.enter_context(zenoh.open(config))
         session.declare_subscriber(
             f"{PREFIX}/thermal/event", lambda sample: seen.append(json.loads(sample.payload.to_bytes()))
@@ -101,7 +105,6 @@ def test_a_printed_probe_corrects_the_offset(tmp_path: Path) -> None:
         path.write_text(FILE.format(port=port, control=control.address))
         stack.enter_context(bridge(path, lines))
         until(lambda: control.clients == 1, "the bridge at the control")
-        assert receiver.probe_wanted is not None and receiver.probe_wanted.wanted  # none was taken since the zero
         settled_s = time.monotonic() + 0.3  # the line must be quiet after connecting
         until(lambda: time.monotonic() > settled_s, "settle_s")
         reading = touch_um(y_um=DEFORMATION_UM, offset_um=receiver.follower.applied_um)

@@ -108,11 +108,6 @@ class RecordSignals(Signals[Vector]):
         """Whether nothing is known to be left from before the record."""
         return self.warmth == COLD and self.initial_um is None
 
-    @property
-    def may_begin_warm(self) -> bool:
-        """Whether the machine is warm at its start wherever it may be at rest: its couples may differ there."""
-        return any(warmth != COLD for warmth in self.warmths.values())
-
     def begun(self, rest: str) -> RecordSignals:
         """Return the record as it begins if the machine is at rest there."""
         warmth = self.warmths.get(rest, COLD)

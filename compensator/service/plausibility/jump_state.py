@@ -92,6 +92,11 @@ class JumpState(msgspec.Struct, kw_only=True):
         self.samples, self.ratio = 0, 0.0
         self.y_for = self.y_against = self.probes_for = self.probes_against = 0
 
+    def suspect(self, *, was_used: bool = False) -> None:
+        """Use the channels no longer that were watched or unconfirmed."""
+        self.is_suspect, self.is_unconfirmed, self.was_used = True, False, was_used
+        self.start_evidence()
+
     def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:
         """Return the state when a channel has jumped, or may have while it was not seen."""
         again = self.again + 1 if self.quiet < FORGOTTEN_SAMPLES else 0

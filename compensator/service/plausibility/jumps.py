@@ -49,7 +49,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.config import Config
-from compensator.events import EventKind, Implausibility, Note
+from compensator.events import Note
 from compensator.messages import ChannelSample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
@@ -57,48 +57,24 @@ from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.jump_engines import (
     UNSEEN_SAMPLES,
     JumpEngines,
-    Run,
     count_held,
-    expected_value,
     is_unsteady,
     moves,
-    needed_samples,
     shifts_against,
 )
 from compensator.service.plausibility.jump_evidence import (
-    confirmed_by,
     is_contradicted,
-    is_unlikely,
     weigh_probe,
     weigh_y,
 )
-from compensator.service.plausibility.jump_signs import NAMES, JumpSigns, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
+from compensator.service.plausibility.jump_verdict import Judgement, suspected, watched
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
-#: A jump within the permitted rate is watched for this number of samples.
-WATCHED_SAMPLES = 15
 #: Weight of a new residual in the level before a jump.
 _LEVEL = 0.1
-
-
-class Judgement(msgspec.Struct, frozen=True):
-    """What a sample has shown.
-
-    Parameters
-    ----------
-    estimate : Estimate, optional
-        The estimate after this sample, if the engine was given another state; None if it is still to be stepped.
-    notes : list of Note
-        Events.
-    accepted : dict of str to float
-        Channels that are used again, with their values, °C.
-    """
-
-    estimate: Estimate | None = None
-    notes: list[Note] = []
-    accepted: dict[str, float] = {}
 
 
 class JumpWatch:
@@ -293,7 +269,9 @@ class JumpWatch:
         weigh_y(self._state, engines, y_um, self._y_std_um)
         is_suspect = self._state.is_suspect
         estimate = engines.go_without(engine, self._state, offered, others) if was_unconfirmed and is_suspect else None
-        verdict = (self._suspected if is_suspect else self._watched)(engine, engines, offered)
+        verdict = (suspected if is_suspect else watched)(engine, engines, self._state, offered)
+        if verdict.ends:
+            self._end()
         return Judgement(verdict.estimate or estimate, [*notes, *verdict.notes], verdict.accepted)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
@@ -339,11 +317,6 @@ class JumpWatch:
         used, other = engines.believing.estimate if state.is_unconfirmed else self._estimate, engines.shifted.estimate
         return (used, other) if used is not None and other is not None else None
 
-    def _suspect(self, *, was_used: bool = False) -> None:
-        """Use the channels no longer that were watched or unconfirmed."""
-        self._state.is_suspect, self._state.is_unconfirmed, self._state.was_used = True, False, was_used
-        self._state.start_evidence()
-
     def _use_no_longer(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
         """Suspect unconfirmed channels that jump again: what they have shown is kept if nothing contradicts it."""
         state = self._state
@@ -352,7 +325,7 @@ class JumpWatch:
             state.age = 0
         else:
             engine.restore(engines.shifted.engine.snapshot())
-        self._suspect(was_used=was_used)
+        self._state.suspect(was_used=was_used)
         self._believe_anew(engine, engines, offered)
 
     def _believe_anew(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
@@ -390,74 +363,6 @@ class JumpWatch:
         return [
             name for name, samples in unseen.items() if samples >= UNSEEN_SAMPLES and name not in self._state.unseen
         ]
-
-    def _suspected(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
-        state = self._state
-        needed = needed_samples(state)
-        if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
-            return self._accept(engine, offered, engines.shifted, "has returned to what was expected before")
-        if state.at_held >= needed and not state.was_used:
-            return self._accept(engine, offered, None, "has returned to where it was before")
-        by = confirmed_by(state)
-        if by:
-            return self._accept(engine, offered, engines.believing, f"is used again: {by} with it")
-        if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
-            return self._settle(engine, engines, offered)
-        return Judgement()
-
-    def _settle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
-        """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
-        state = self._state
-        notes = []
-        for name in state.shifts_k:
-            expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
-            state.shifts_k[name] = offered[name] - expected
-            notes.append(unconfirmed_note(name, state.shifts_k[name]))
-        engine.restore(engines.believing.engine.snapshot())
-        state.is_suspect, state.is_unconfirmed = False, True
-        state.samples, state.ratio = 0, 0.0
-        return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
-
-    def _accept(self, engine: Engine, offered: Mapping[str, float], run: Run | None, how: str) -> Judgement:
-        names = list(self._state.shifts_k)
-        notes = [
-            Note(
-                EventKind.PLAUSIBILITY,
-                f"{NAMES[name]} {how}",
-                {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": self._state.shifts_k[name]},
-            )
-            for name in names
-        ]
-        estimate = None
-        if run is not None:
-            engine.restore(run.engine.snapshot())
-            estimate = run.estimate
-        self._end()
-        return Judgement(estimate, notes, {name: offered[name] for name in names})
-
-    def _watched(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
-        """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor."""
-        state, shifted = self._state, engines.shifted
-        is_refuted = is_unlikely(state)
-        if state.is_unconfirmed:
-            by = confirmed_by(state)
-            if by:
-                return self._accept(engine, offered, None, f"is confirmed: {by} with it")
-            # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
-            is_refuted |= is_contradicted(state) and not is_unsteady(state)
-        if is_refuted:
-            engine.restore(shifted.engine.snapshot())
-            estimate = shifted.estimate
-            if all(state.back.get(name, 0) > 0 for name in state.shifts_k):
-                notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
-                self._end()
-            else:
-                notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
-                self._suspect()
-            return Judgement(estimate, notes)
-        if state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed:
-            self._end()
-        return Judgement()
 
 
 def _quality(channel: ChannelSample | None) -> str:

@@ -1,0 +1,129 @@
+"""What a jump turns out to be, sample by sample: one of the sensor, or of the temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+
+from compensator.events import EventKind, Implausibility, Note
+from compensator.model.engine import Engine, Estimate
+from compensator.service.plausibility.jump_engines import (
+    JumpEngines,
+    Run,
+    expected_value,
+    is_unsteady,
+    needed_samples,
+)
+from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_unlikely
+from compensator.service.plausibility.jump_signs import NAMES, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_state import JumpState
+
+#: A jump within the permitted rate is watched for this number of samples.
+WATCHED_SAMPLES = 15
+
+
+class Judgement(msgspec.Struct, frozen=True):
+    """What a sample has shown.
+
+    Parameters
+    ----------
+    estimate : Estimate, optional
+        The estimate after this sample, if the engine was given another state; None if it is still to be stepped.
+    notes : list of Note
+        Events.
+    accepted : dict of str to float
+        Channels that are used again, with their values, °C.
+    ends : bool
+        Whether the jump is over: all channels are used as they are.
+    """
+
+    estimate: Estimate | None = None
+    notes: list[Note] = []
+    accepted: dict[str, float] = {}
+    ends: bool = False
+
+
+def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+    """Decide whether channels that are not used are used again, and from which engine on.
+
+    Parameters
+    ----------
+    engine : Engine
+        Engine of the compensation; it may be given the state of one of the two engines.
+    engines : JumpEngines
+        The engine that believes the channels, and the one that takes them less their jump.
+    state : JumpState
+        State of the watch.
+    offered : mapping of str to float
+        Measured temperatures, °C.
+    """
+    needed = needed_samples(state)
+    if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
+        return _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
+    if state.at_held >= needed and not state.was_used:
+        return _accept(engine, state, offered, None, "has returned to where it was before")
+    by = confirmed_by(state)
+    if by:
+        return _accept(engine, state, offered, engines.believing, f"is used again: {by} with it")
+    if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
+        return _settle(engine, engines, state, offered)
+    return Judgement()
+
+
+def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+    """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
+    notes = []
+    for name in state.shifts_k:
+        expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
+        state.shifts_k[name] = offered[name] - expected
+        notes.append(unconfirmed_note(name, state.shifts_k[name]))
+    engine.restore(engines.believing.engine.snapshot())
+    state.is_suspect, state.is_unconfirmed = False, True
+    state.samples, state.ratio = 0, 0.0
+    return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
+
+
+def _accept(engine: Engine, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str) -> Judgement:
+    names = list(state.shifts_k)
+    notes = [
+        Note(
+            EventKind.PLAUSIBILITY,
+            f"{NAMES[name]} {how}",
+            {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": state.shifts_k[name]},
+        )
+        for name in names
+    ]
+    estimate = None
+    if run is not None:
+        engine.restore(run.engine.snapshot())
+        estimate = run.estimate
+    return Judgement(estimate, notes, {name: offered[name] for name in names}, ends=True)
+
+
+def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+    """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor.
+
+    Parameters
+    ----------
+    engine, engines, state, offered
+        As `suspected` has them.
+    """
+    shifted = engines.shifted
+    is_refuted = is_unlikely(state)
+    if state.is_unconfirmed:
+        by = confirmed_by(state)
+        if by:
+            return _accept(engine, state, offered, None, f"is confirmed: {by} with it")
+        # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
+        is_refuted |= is_contradicted(state) and not is_unsteady(state)
+    if is_refuted:
+        engine.restore(shifted.engine.snapshot())
+        estimate = shifted.estimate
+        if all(state.back.get(name, 0) > 0 for name in state.shifts_k):
+            notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
+            return Judgement(estimate, notes, ends=True)
+        notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
+        state.suspect()
+        return Judgement(estimate, notes)
+    return Judgement(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
