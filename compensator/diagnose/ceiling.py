@@ -144,7 +144,8 @@ def _why_deployed(rest: Mapping[str, Any]) -> str:
             "they hold only with it. Held-out data do not decide it."
         )
     if rest.get("instead"):
-        return f"{deployed} in place of the named effects, because all data are more probable with it."
+        why = "which leave more on held-out data" if _lowers(rest) else "because all data are more probable with it"
+        return f"{deployed} in place of the named effects, {why}."
     if not _lowers(rest):
         return f"{deployed}, because all data are more probable with it."
     return f"{deployed}."

@@ -21,7 +21,7 @@ from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of, in_free_run
+from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
 from compensator.diagnose.fit import Term, fit_terms, late_term
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
@@ -93,6 +93,7 @@ def diagnose(
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = held_out_of(found, places, progress, executor_map)
     found, effects, held_out = _worth_deploying(found, effects, held_out)
+    found, effects, held_out = _by_channels(found, effects, held_out)
     few = evidence.is_sparse
     reverses = any(effect.reverses_path for effect in effects)
     worse_um = _worse_in_free_run(found)
@@ -175,7 +176,7 @@ def _worth_deploying(
     if evidence.is_sparse:
         # Few values: chance lowers the error of no remainder by much.
         helps = whole_um < LOWERS * min(named_um, nothing_um)
-    elif found.explains and late_term(found.selection.fit):
+    elif late_term(found.selection.fit):
         helps = whole_um < LOWERS_LATE * named_um
     else:
         helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
@@ -183,6 +184,17 @@ def _worth_deploying(
         return found, effects, held_out
     without = dataclasses.replace(held_out, whole=held_out.named)
     return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
+
+
+def _by_channels(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
+) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+    """Deploy all channels in the place of names with which the engine is worse, where held-out data confirm them."""
+    instead = by_channels(found)
+    if instead is None or rms_of(held_out.ceiling) > min(map(rms_of, (held_out.whole, held_out.nothing))):
+        return found, effects, held_out
+    effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
+    return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
 
 
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:

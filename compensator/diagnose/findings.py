@@ -50,9 +50,6 @@ class Findings:
         What the base's paths alone would explain, where nothing was known of them; 0 elsewhere, µm.
     refitted : Regressed or None
         The base's paths fitted together with the named effects, where nothing was known of them.
-    by_channels : bool
-        Whether it is in their place because they are worse than nothing in free run. They may be right, and the engine
-        can do nothing with them: what a late T_Q hides may be most of the effect.
     """
 
     search: Search
@@ -66,7 +63,6 @@ class Findings:
     channels: Regressed
     paths: Vector
     refitted: Regressed | None
-    by_channels: bool = False
 
     @property
     def named(self) -> Vector:
@@ -99,9 +95,7 @@ class Findings:
         return float(np.hypot(rest.slow_um, rest.own_um))
 
 
-def findings_of(
-    evidence: Evidence, *, unobserved: bool = True, by_channels: bool | None = None, grid: Grid | None = None
-) -> Findings:
+def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None) -> Findings:
     """Search in some evidence.
 
     Parameters
@@ -110,43 +104,39 @@ def findings_of(
         Residual and signals; nothing but the samples used takes part.
     unobserved : bool
         Whether an unobserved source is looked for.
-    by_channels : bool, optional
-        Whether all channels are in the place of names (`Findings.by_channels`); where something is held out, as over
-        all data, for what is judged is what is deployed. Without it, where they are better in free run.
     grid : Grid, optional
         That of a search over all data, where something is held out.
     """
     found = _findings_of(evidence, grid, unobserved=unobserved)
-    if evidence.is_sparse:
+    if evidence.is_sparse or all(term.effect.observed for term in found.terms) or _is_no_worse(found):
         return found
-    if not _is_no_worse(found) and any(not term.effect.observed for term in found.terms):
-        # The effects make up for the source. Channels that explain most of it alone take their place.
-        shown = _findings_of(evidence, found.search.grid, unobserved=False)
-        rms = found.search.criterion.rms
-        nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
-        is_better = in_free_run(shown)[1] < in_free_run(found)[1]
-        found = shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
-    if by_channels is None:
-        by_channels = _are_channels_better(found)
-    return _by_channels(found) if by_channels else found
+    # The effects make up for the source. Channels that explain most of it alone take their place.
+    shown = _findings_of(evidence, found.search.grid, unobserved=False)
+    rms = found.search.criterion.rms
+    nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
+    is_better = in_free_run(shown)[1] < in_free_run(found)[1]
+    return shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
+
+
+def by_channels(found: Findings) -> Findings | None:
+    """Return findings with all channels in the place of names that are worse than nothing in free run.
+
+    Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect. None
+    where the names are not worse, or where all channels are worse, too.
+    """
+    evidence = found.search.evidence
+    if evidence.is_sparse or not found.terms or _is_no_worse(found):
+        return None
+    if not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
+        return None
+    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False)
+    return instead if _is_no_worse(instead) else None
 
 
 def _is_no_worse(found: Findings) -> bool:
     """Return whether what would be deployed leaves no more in free run than the base model."""
     base_um, own_um = in_free_run(found)
     return own_um <= base_um
-
-
-def _are_channels_better(found: Findings) -> bool:
-    """Return whether the names are worse than nothing in free run, and all channels in their place are not."""
-    if not found.terms or _is_no_worse(found):
-        return False
-    nothing = _log_evidence(found.selection.before)
-    return _is_worth_deploying(found.channels, nothing, found.search.evidence) and _is_no_worse(_by_channels(found))
-
-
-def _by_channels(found: Findings) -> Findings:
-    return dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False, by_channels=True)
 
 
 def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> Findings:

@@ -54,8 +54,7 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     unobserved = any(hidden) and not all(hidden)
     # Another process computes the columns sooner than it gets them.
     grid = found.search.grid if executor_map is map else None
-    search = partial(_predictions, places=places, unobserved=unobserved, by_channels=found.by_channels, grid=grid)
-    predicted = executor_map(search, views)
+    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=grid), views)
     left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
@@ -91,10 +90,8 @@ class _Predictions:
     has: Indices
 
 
-def _predictions(
-    seen: Evidence, *, places: Sequence[Place], unobserved: bool, by_channels: bool, grid: Grid | None
-) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved, by_channels=by_channels, grid=grid)
+def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid | None) -> _Predictions:
+    found = findings_of(seen, unobserved=unobserved, grid=grid)
     steps, total = [], found.own_paths
     for place in places:
         total = sum(

@@ -114,7 +114,7 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
     left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
     if rest.get("instead"):
         return (
-            f"What is named resembles the cause most: {left}. All channels together make the data more probable: the "
+            f"What is named resembles the cause most: {left}. All channels together do better: the "
             f"remainder, which explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
         )
     return (

@@ -12,9 +12,9 @@ import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import findings as module
-from compensator.diagnose.diagnosis import _evidence
-from compensator.diagnose.findings import findings_of, in_free_run
-from compensator.diagnose.held_out import held_out_of
+from compensator.diagnose.diagnosis import _by_channels, _evidence
+from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
+from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.summary import verdict
 from sim_hardware.drawn_machines.cases import _cases
@@ -103,26 +103,32 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     assert [term.hypothesis.place for term in found.terms] == [("nonlinear", "DTF", "")]
 
 
-def test_all_channels_take_the_place_of_names_with_which_the_engine_is_worse_than_without() -> None:
-    # A T_Q that is called late by 4 min, in 6 h: what the engine cannot foretell of it is more than the effect.
+@pytest.fixture(scope="module")
+def called_late() -> Findings:
+    """A T_Q that is called late by 4 min, in 6 h: what the engine cannot foretell of it is more than the effect."""
     machine = next(c for c in _cases(170_000) if (c.family, c.seed) == ("conduction", 170_011)).draw()
     base = tc.identify(machine.calibration.columns).model
     runs, _ = runs_in(measurements(machine.record.columns, "data", None), base.period_s)
-    evidence = _evidence(base, runs)
-    named, found = findings_of(evidence, by_channels=False), findings_of(evidence)
-    before_um, after_um = in_free_run(named)
-    assert named.explains and after_um > before_um
-    assert found.by_channels and not found.explains and in_free_run(found)[1] < 0.5 * before_um
-    assert [term.hypothesis.place for term in found.terms] == [term.hypothesis.place for term in named.terms]
-    # What is held out judges what would be deployed, also where the rest of the data would decide otherwise.
-    asked: list[Any] = []
+    return findings_of(_evidence(base, runs))
 
-    def noted(search: Any, views: Any) -> Any:
-        asked.append(search.keywords["by_channels"])
-        return map(search, views)
 
-    held_out = held_out_of(found, [], lambda done, of: None, noted)
-    assert asked == [True] and np.nanmax(np.abs(held_out.whole - held_out.ceiling)) == 0.0
+def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(called_late: Findings) -> None:
+    before_um, after_um = in_free_run(called_late)
+    assert called_late.explains and after_um > before_um
+    instead = by_channels(called_late)
+    assert instead is not None and not instead.explains and instead.terms == called_late.terms
+    assert in_free_run(instead)[1] < 0.5 * before_um and by_channels(instead) is None
+
+
+@pytest.mark.parametrize(("channels_um", "is_confirmed"), [(0.9, True), (1.1, False)])
+def test_all_channels_take_their_place_where_held_out_data_confirm_it(
+    called_late: Findings, channels_um: float, is_confirmed: bool
+) -> None:
+    ones = np.ones(called_late.ceiling.size)
+    held_out = HeldOut(nothing=ones, named=2.0 * ones, whole=2.0 * ones, ceiling=channels_um * ones, steps=())
+    found, _, judged = _by_channels(called_late, (), held_out)
+    assert found.explains is not is_confirmed
+    assert judged.whole[0] == (channels_um if is_confirmed else 2.0)
 
 
 def test_it_is_said_why_nothing_is_deployed() -> None:

@@ -80,7 +80,7 @@ class DelayedSensor(DelayedPath):
     def explain(self, seen: Seen) -> str:
         what = "the sensor T_Q is late" if self.form == "sensor" else "the heat reaches T_Q late,"
         return (
-            f"{seen.words} after changes of the heat: {what} by {self._times()}. The extended model corrects this in "
+            f"{seen.words} after changes of the heat: {what} by {self._times()}. The model can correct this in "
             "real time, except for the first minutes after a change. Better: move the sensor closer to the source, or "
             "mount it with better thermal contact."
         )
