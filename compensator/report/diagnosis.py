@@ -155,9 +155,10 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
 
 
 def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
-    count = len(diagnosis.effects)
+    remainder, count = diagnosis.remainder, len(diagnosis.effects)
     parts = [name(diagnosis.effects[0]) if count == 1 else f"all {count} effects"] if count else []
-    parts += ["the remainder"] if diagnosis.remainder else []
+    if remainder is not None:
+        parts = ["the remainder, in place of the effects"] if remainder.instead else [*parts, "the remainder"]
     lines = [time.line("before" if parts else "base model", diagnosis.held_out_before)]
     if parts:
         lines.append(time.line(f"after: {' and '.join(parts)}", diagnosis.held_out_after))
