@@ -327,4 +327,5 @@ SEALED_WEEKS = _weeks(880_000, 100)
 #: Each run of some SEALED_WEEKS: their seeds, and date, version, where its figures are.
 SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = (
     ((880_000, 880_025, 880_050, 880_075), "2026-11-23, proposals stay; tests/bench/README.md, The loop"),
+    ((880_001, 880_026, 880_051, 880_076), "2026-11-24, three candidates at once; tests/bench/README.md, The loop"),
 )
