@@ -115,20 +115,28 @@ class Assembler:
         Raises
         ------
         Rejected
-            `axes_disagree`: messages with one number that are not of one sample; all of them are dropped.
+            `axes_disagree`: messages with one number that are not of one sample; those that came before are dropped,
+            and two that contradict each other, too.
             `axis_not_published`, `axis_not_applied`: the axes are not those of the settings.
         """
         self._check(message)
         begun = self._begun.setdefault(message.seq, _Begun(now_s))
-        known = begun.messages.setdefault(message.axis, message)
-        first = next(iter(begun.messages.values()))
-        if known != message or not _of_one_sample(first, message):
+        first = next(iter(begun.messages.values()), message)
+        same = _of_one_sample(first, message)
+        disagree = Rejected(Reason("axes_disagree", f"number {message.seq}: {first.axis} and {message.axis}"))
+        if same and begun.messages.get(message.axis, message) != message:
             del self._begun[message.seq]
-            raise Rejected(Reason("axes_disagree", f"number {message.seq}: {first.axis} and {message.axis}"))
+            raise disagree
+        if not same:
+            # Begun anew, or what is left of one sample would spoil each later one with its number.
+            begun = self._begun[message.seq] = _Begun(now_s)
+        begun.messages[message.axis] = message
         begun.asked |= asked
         if age_s is not None:
             measured_s = now_s - age_s
             begun.measured_s = measured_s if begun.measured_s is None else min(begun.measured_s, measured_s)
+        if not same:
+            raise disagree
         if len(begun.messages) < len(self.axes):
             while len(self._begun) > _SAMPLES_MAX:
                 del self._begun[next(iter(self._begun))]

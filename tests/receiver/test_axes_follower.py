@@ -112,6 +112,14 @@ def test_a_sample_of_which_one_axis_is_not_right_moves_no_axis(axis: str, change
     assert codes(run(f, 156.0, 60.0)[-1]) == set()
 
 
+def test_what_is_left_of_a_sample_does_not_spoil_the_later_ones_with_its_number() -> None:
+    f = follower()
+    f.receive(0.0, "z", axis_offset("z", 1, 1.0, time_utc_ns=1))  # of x and y nothing arrived
+    taken = [f.receive(1.0, axis, axis_offset(axis, 1, 2.0, time_utc_ns=2)) for axis in "xyz"]
+    assert taken == [False, False, True]
+    assert codes(run(f, 1.0, 60.0)[-1]) == set()
+
+
 def test_an_axis_that_stays_away_is_named() -> None:
     f = follower()
     for seq in range(1, 4):
