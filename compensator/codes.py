@@ -503,6 +503,11 @@ class ModelWarning(Code):
         "The base model was calibrated while the effect acted, so its paths were refitted together with the effect.",
         "Check the extended model on another day before relying on it.",
     )
+    PATHS_KEPT = (
+        "paths_kept",
+        "The base model misses much of its own calibration, and its paths were kept as they are.",
+        "Calibrate it anew, or let a diagnosis fit its paths together with the effects (without --keep-paths).",
+    )
 
 
 class DataRemark(Code):

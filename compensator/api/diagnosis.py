@@ -278,6 +278,7 @@ def diagnose(
     y_std_um: float | None = None,
     fit_until_h: float | None = None,
     validate: DataLike = (),
+    keep_paths: bool = False,
     progress: Progress = unreported,
     executor: Executor | None = None,
 ) -> DiagnosisResult | DiagnosedAxes:
@@ -302,6 +303,9 @@ def diagnose(
         Search up to this hour of each of the data; both models are validated on the rest.
     validate : DataLike
         Further data on which both models are validated.
+    keep_paths : bool
+        Keep the paths of the base model as they are. By default they are fitted anew together with the effects where
+        the model misses much of its own calibration.
     progress : callable
         Called with the steps done and their number.
     executor : concurrent.futures.Executor, optional
@@ -345,6 +349,7 @@ def diagnose(
                 fit_until_h=fit_until_h,
                 y_std_um=y_std_um,
                 expected=expected,
+                keep_paths=keep_paths,
                 progress=lambda done, steps: progress(number * steps + done, of * steps),
                 executor_map=executor_map if executor else map,
             )
@@ -373,6 +378,7 @@ def _diagnosed(
     fit_until_h: float | None,
     y_std_um: float | None,
     expected: frozenset[Place],
+    keep_paths: bool,
     progress: Progress,
     executor_map: ExecutorMap,
 ) -> DiagnosisResult:
@@ -385,7 +391,9 @@ def _diagnosed(
     require_y_noise(name_of(runs), runs)
     for one in validation:  # refused before the search, which may take minutes
         remarks += screened([one])[1]
-    found = find_effects(base, runs, expected=expected, progress=progress, executor_map=executor_map)
+    found = find_effects(
+        base, runs, expected=expected, keep_paths=keep_paths, progress=progress, executor_map=executor_map
+    )
     remarks += found.evidence.no_causes.values()
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}

@@ -11,6 +11,7 @@ import numpy as np
 
 from compensator.api.diagnosis import DiagnosisResult, diagnose
 from compensator.arrays import Vector
+from compensator.codes import ModelWarning
 from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
@@ -159,7 +160,8 @@ def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> 
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None
-    found = diagnose(base, [measured], y_std_um=y_std_um)
+    # Of other paths a person decides: the loop only adds effects to the calibrated ones.
+    found = diagnose(base, [measured], y_std_um=y_std_um, keep_paths=True)
     assert isinstance(found, DiagnosisResult)  # a base is of one axis
     return found
 
@@ -176,8 +178,9 @@ def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> 
 
 
 def _needs(found: DiagnosisResult) -> str:
-    """Return what a person has to do: about effects that cannot be compensated, and where a sensor is missing."""
+    """Return what a person has to do: effects that cannot be compensated, a poor calibration, a missing sensor."""
     left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
     needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
+    needs += [one for one in found.diagnosis.warnings if one.code == ModelWarning.PATHS_KEPT]
     advice = found.diagnosis.advice
     return " ".join([*needs, *([advice.sensor] if advice is not None and advice.sensor else [])])

@@ -202,6 +202,8 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--fit-until", type=_number(0.0, 1e6), metavar="H", help=words)
     words = "data that take no part in the search, to validate both models; may be repeated"
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
+    words = "keep the paths of the model even where it misses much of its own calibration, as the loop does"
+    add("--keep-paths", action="store_true", help=words)
     _page(parser)
     _column(parser)
     _axis(parser, "all that model and data have")

@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         scheduler=given.scheduler,
         fit_until_h=given.fit_until,
         validate=given.validate,
+        keep_paths=given.keep_paths,
         also=page,
     )
 
@@ -50,6 +51,7 @@ def diagnose_files(
     scheduler: str | None = None,
     fit_until_h: float | None = None,
     validate: Sequence[Path] = (),
+    keep_paths: bool = False,
     also: Path | None = None,
 ) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
@@ -67,6 +69,7 @@ def diagnose_files(
             y_std_um=y_std_um,
             fit_until_h=fit_until_h,
             validate=validate,
+            keep_paths=keep_paths,
             progress=progress,
             executor=executor,
         )

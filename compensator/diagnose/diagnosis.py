@@ -57,6 +57,7 @@ def diagnose(
     runs: Sequence[Run],
     *,
     expected: frozenset[Place] = frozenset(),
+    keep_paths: bool = False,
     progress: Progress = unreported,
     executor_map: ExecutorMap = map,
 ) -> Diagnosis:
@@ -70,6 +71,8 @@ def diagnose(
         Measured data with y and every channel that was logged.
     expected : frozenset of Place
         Effects that another axis of the machine shows.
+    keep_paths : bool
+        Keep the paths of the base as they are even if its own calibration left much.
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -80,11 +83,12 @@ def diagnose(
     DataError
         If there is too little data.
     """
-    evidence = _evidence(model, runs, expected)
+    evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
+    evidence = evidence_of_runs(runs)
     progress(0, len(list(evidence.blocks(FOLDS))) + 1)
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
-        found, left_out = without_chips(found, partial(_evidence, model, expected=expected))
+        found, left_out = without_chips(found, evidence_of_runs)
     found = _as_begun(found)
     evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
@@ -142,7 +146,7 @@ def diagnose(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found, effects),
-        warnings=(*left_out, *remarks, *warnings),
+        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict), *warnings),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),
         ceiling=ceiling,
@@ -232,12 +236,27 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
     )
 
 
-def _evidence(model: ThermalModel, runs: Sequence[Run], expected: frozenset[Place] = frozenset()) -> Evidence:
-    """Return the evidence of runs, with free paths where the model is far off."""
+def _evidence(model: ThermalModel, runs: Sequence[Run], *, expected: frozenset[Place], keep_paths: bool) -> Evidence:
+    """Return the evidence of runs, with free paths where the model is far off, unless they are to be kept."""
     evidence = dataclasses.replace(evidence_of(model, runs), expected=expected)
+    return evidence.with_free_paths() if _is_far_off(evidence) and not keep_paths else evidence
+
+
+def _is_far_off(evidence: Evidence) -> bool:
     # The noise of a calibration says nothing about its paths.
-    own_um2 = (model.held_out_rms_um or 0.0) ** 2 - evidence.noise.noise_um**2
-    return evidence.with_free_paths() if own_um2 > (FAR_OFF * evidence.spread_um) ** 2 else evidence
+    own_um2 = (evidence.model.held_out_rms_um or 0.0) ** 2 - evidence.noise.noise_um**2
+    return own_um2 > (FAR_OFF * evidence.spread_um) ** 2
+
+
+def _paths_kept(evidence: Evidence, verdict: Verdict) -> list[Remark]:
+    """Return the remark that paths were kept which would be fitted anew, where something is missing."""
+    if verdict == "adequate" or evidence.free_paths or not _is_far_off(evidence):
+        return []
+    text = (
+        f"The calibration of the model left {evidence.model.held_out_rms_um:.1f} µm rms, much of the "
+        f"{evidence.spread_um:.1f} µm by which Y varies here, and its paths were kept."
+    )
+    return [Remark(ModelWarning.PATHS_KEPT, text)]
 
 
 def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]:

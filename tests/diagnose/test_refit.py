@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.background import Background
@@ -110,6 +111,17 @@ def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found
 def test_the_extended_model_says_what_error_it_has_left(found):
     assert 0.0 < found.model.y_std_um < 1.5
     assert any("were refitted" in str(words) for words in found.warnings)
+
+
+def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(model, runs, found):
+    kept = diagnose(model, runs, keep_paths=True)
+    assert (kept.model.dtf, kept.model.tdtf) == (model.dtf, model.tdtf) and found.model.dtf != model.dtf
+    assert [e.place for e in kept.effects][:1] == [("input", "", "spindle_rpm")]
+    codes = [one.code for one in kept.warnings]
+    assert ModelWarning.PATHS_KEPT in codes and ModelWarning.FITTED_ANEW not in codes
+    silent = dataclasses.replace(model, held_out_rms_um=None)
+    others = diagnose(silent, runs, keep_paths=True).warnings
+    assert ModelWarning.PATHS_KEPT not in [one.code for one in others]
 
 
 @pytest.mark.parametrize(("times", "deployed"), [(2.0, True), (3.0, False)])

@@ -26,7 +26,7 @@ from compensator.service.loop import live
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.found import Found
-from compensator.service.loop.loop import Loop
+from compensator.service.loop.loop import Loop, StartDiagnosis
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running
@@ -293,9 +293,26 @@ def test_a_warm_up_that_nothing_waits_for_does_not_end_the_diagnosis_under_way(t
     parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
     loop = live.LiveLoop(settings(), parts, tmp_path, events=Mock(), journal=Mock(), clock=Mock())
     dismissed = DiagnosisData(verdict="explained", candidate_sha256="c" * 64)
-    loop._warming = Found(Weighed(dismissed, b""), "", why="the candidate cannot be warmed up")
+    wanted = StartDiagnosis(from_utc_ns=0, to_utc_ns=1, why="misfit")
+    loop._warming = Found(wanted, Weighed(dismissed, b""), "", why="the candidate cannot be warmed up")
     loop.hand_over(Mock())
     assert core.state.diagnosis is under_way and loop._warming is None
+
+
+def test_the_result_of_a_diagnosis_that_has_ended_is_not_taken_for_that_of_the_next_one(tmp_path: Path) -> None:
+    """A defect has ended the first one while its process ran on, and the next one has begun meanwhile."""
+    core = ModelLoop(settings(), parse_model(QUILL, source="test"), {})
+    core.state.diagnosis = under_way = Running(from_utc_ns=0, to_utc_ns=2, why="planned")
+    parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
+    events = Mock()
+    loop = live.LiveLoop(settings(), parts, tmp_path, events=events, journal=Mock(), clock=Mock())
+    nothing = Weighed(DiagnosisData(verdict="adequate"), None)
+    for to_utc_ns, taken in ((1, False), (2, True)):
+        wanted = StartDiagnosis(from_utc_ns=0, to_utc_ns=to_utc_ns, why="planned")
+        loop._found = Found(wanted, nothing, "nothing to deploy")
+        loop.hand_over(Mock())
+        assert events.note.called is taken and (core.state.diagnosis is under_way) is not taken
+    assert loop._found is None
 
 
 async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_the_same_of_both(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from compensator.errors import CompensatorError
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
+from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.weighing import Weighed
@@ -29,6 +30,8 @@ class Found:
 
     Parameters
     ----------
+    wanted : StartDiagnosis
+        What was diagnosed.
     weighed : Weighed
         The diagnosis, and what follows from it.
     text : str
@@ -41,6 +44,7 @@ class Found:
         Why the candidate cannot be used; empty if it can.
     """
 
+    wanted: StartDiagnosis
     weighed: Weighed
     text: str
     warmed: tuple[Compensation, ErrorBlocks] | None = None
@@ -105,7 +109,7 @@ async def diagnosed(core: ModelLoop, diagnose: Diagnose, store: ModelStore, cloc
         log.exception("internal error of a diagnosis")
         found = failed(f"internal error: {type(error).__name__}: {error}")
         weighed = core.plain(found)
-    return Found(weighed.lasting((clock.utc_ns() - began_ns) / NS), found.text)
+    return Found(wanted, weighed.lasting((clock.utc_ns() - began_ns) / NS), found.text)
 
 
 def _internal(error: Exception) -> str:

@@ -167,7 +167,8 @@ class LiveLoop:
 
     def _hand_over(self, core: ModelLoop, now_ns: int) -> None:
         found, self._found = self._found, None
-        if found is not None and core.state.diagnosis is not None:
+        # Where a defect ended a diagnosis, another one may have begun meanwhile.
+        if found is not None and found.wanted == core.loop.wanted:
             self._events.note(EventKind.DIAGNOSIS, found.text, found.weighed.data.table())
             self._note(core.receive(found.weighed.data, now_ns))
             if core.state.diagnosis is not None and found.weighed.candidate is not None:
