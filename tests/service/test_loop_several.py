@@ -20,6 +20,7 @@ from compensator.service.loop.loop import Loop
 from compensator.service.loop.proof import CANDIDATES, shared
 from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
 from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
@@ -346,7 +347,11 @@ async def test_the_service_proposes_what_surpasses_a_proposal_and_a_replay_decid
     service = await proposed(tmp_path, NOTHING, shown(first), shown(second))
     assert len(service.asked) == 2
     later: Iterator[int] = itertools.count()
-    await service.run(2400, until=lambda _: ("withdraw", "surpassed") in service.steps() and next(later) == 20)
+
+    def is_surpassed(_: Outcome) -> bool:
+        return any(event.data.get("why") == "surpassed" for event in service.events("loop")) and next(later) == 20
+
+    await service.run(2400, until=is_surpassed)
     steps = [step for step in service.steps() if step[0] != "diagnose"]
     at = steps.index(("withdraw", "surpassed"))
     assert steps[at - 2 : at + 2] == [("propose", ""), ("shadow", ""), ("withdraw", "surpassed"), ("propose", "")]
