@@ -28,6 +28,9 @@ from drivers.errors import DriverError
 
 log = logging.getLogger("compensator")
 
+#: Longest line of an error, characters; several files are named in one of them at times.
+LONGEST_LINE = 4000
+
 
 class Command(NamedTuple):
     """A command; the function of the same name in `commands.arguments` adds its arguments.
@@ -156,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:
             raise
-        log.error("compensator: %s", _in_words(error))
+        log.error("compensator: %s", shortened(_in_words(error)))
         result = getattr(error, "result", None)
         if given.json and result is not None:
             sys.stdout.write(f"{json.dumps(result)}\n")
@@ -193,6 +196,11 @@ def _in_words(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename2 or error.filename}: {error.strerror or error}"
     return str(error)
+
+
+def shortened(line: str) -> str:
+    """Return a line without the middle of what is longer than any error needs, such as a file's key that it cites."""
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
 
 
 def _did_you_mean(word: str, names: Sequence[str]) -> str:

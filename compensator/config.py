@@ -23,8 +23,8 @@ Kelvins = Annotated[float, Meta(gt=0, le=200)]
 Minutes = Annotated[float, Meta(gt=0, le=100_000)]
 #: Of a channel of any unit, such as rpm/min.
 Rate = Annotated[float, Meta(gt=0, le=1e9)]
-#: Megabytes, or days.
-Amount = Annotated[float, Meta(gt=0, le=1e9)]
+#: Megabytes, or days, that are kept: a slip of the pen must not remove a whole history.
+Amount = Annotated[float, Meta(ge=1, le=1e9)]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")

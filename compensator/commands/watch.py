@@ -104,6 +104,8 @@ def _token(path: Path | None) -> str:
         token = secrets.token_urlsafe(16)
         replace_file(path, f"{token}\n".encode(), mode=0o600)
         return token
+    except OSError as error:
+        raise UsageError(f"--token {path}: {error.strerror}, expected a file for the token of the page") from error
     if not TOKEN.fullmatch(token):
         shown = f"{len(token)} characters" if token else "empty"
         words = "expected 16 to 128 letters, digits, - or _; remove the file and it is made"

@@ -439,8 +439,9 @@ class Container:
             self._note("the end of the data is longer than the recorder writes it")
         self._at += 9 + len(body)
         summary, summary_start = zlib.crc32(b""), self._base + self._at
+        code = DATA_END
         while True:
-            code, length = self._frame()
+            last, (code, length) = code, self._frame()
             start = self._at
             self._at += 9 + length
             record = self._buffer[start : self._at]
@@ -455,6 +456,8 @@ class Container:
         stated = int.from_bytes(record[25:29], "little")
         if len(record) > 29:
             self._note("the footer is longer than the recorder writes it")
+        if last not in (DATA_END, SUMMARY_OFFSET):
+            self._note("the summary has no summary offsets")
         if not stated:
             self._note("the summary has no CRC")
         elif stated != zlib.crc32(record[:25], summary):

@@ -14,7 +14,7 @@ import pytest
 from compensator.audit.series import Audit, audit, summary
 from compensator.cli import main
 from compensator.recording.container import MAGIC
-from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, FOOTER, HEADER, SCHEMA
+from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, FOOTER, HEADER, SCHEMA, SUMMARY_OFFSET
 from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, Service
 
@@ -156,7 +156,16 @@ def attachment_crc(data: bytes) -> bytes:
     return _resealed(changed)
 
 
-@pytest.mark.parametrize("change", [header, data_crc, summary_crc, chunk_crc, attachment_crc])
+def summary_offsets(data: bytes) -> bytes:
+    there = records(data)
+    first = next(at for code, at, _ in there if code == SUMMARY_OFFSET)
+    footer, length = next((at, length) for code, at, length in there if code == FOOTER)
+    end = bytearray(data[footer : footer + length])
+    struct.pack_into("<Q", end, 9 + 8, 0)
+    return _resealed(bytearray(data[:first] + bytes(end) + data[footer + length :]))
+
+
+@pytest.mark.parametrize("change", [header, data_crc, summary_crc, chunk_crc, attachment_crc, summary_offsets])
 def test_bytes_that_carry_no_record_are_remarked_on(
     tmp_path: Path, made: list[tuple[str, bytes]], change: Callable[[bytes], bytes]
 ) -> None:

@@ -257,3 +257,24 @@ def test_numbers_of_the_command_line_are_bounded(
         code = int(str(ended.code))
     said = capsys.readouterr().err
     assert code == 2 and "expected" in said and said.count("\n") == 1 and "Traceback" not in said
+
+
+def test_an_error_does_not_cite_a_whole_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.toml").write_bytes(b'"' + b'\\"' * 400_000 + b'" = 1\n')
+    assert main(["check", "--config", str(tmp_path / "c.toml")]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and len(line) < 5000 and "c.toml" in line
+
+
+def test_a_device_is_no_token(capsys: pytest.CaptureFixture[str]) -> None:
+    ends = ("--connect", "tcp/127.0.0.1:1", "--bind", "127.0.0.1")
+    assert "not a regular file" in refused(capsys, "watch", "--page", "--token", "/dev/zero", *ends)
+
+
+@pytest.mark.parametrize("limit", ["keep_days", "keep_mb"])
+def test_a_history_of_no_length_is_a_slip_of_the_pen(limit: str) -> None:
+    with pytest.raises(ConfigError, match=rf"recording.{limit} = 5e-324: Expected `float` >= 1"):
+        parse_config(
+            CONFIG.replace(b"recording.folder", f"recording.{limit} = 5e-324\nrecording.folder".encode()),
+            source="c.toml",
+        )
