@@ -236,7 +236,9 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
     )
 
 
-def _evidence(model: ThermalModel, runs: Sequence[Run], *, expected: frozenset[Place], keep_paths: bool) -> Evidence:
+def _evidence(
+    model: ThermalModel, runs: Sequence[Run], *, expected: frozenset[Place] = frozenset(), keep_paths: bool = False
+) -> Evidence:
     """Return the evidence of runs, with free paths where the model is far off, unless they are to be kept."""
     evidence = dataclasses.replace(evidence_of(model, runs), expected=expected)
     return evidence.with_free_paths() if _is_far_off(evidence) and not keep_paths else evidence
