@@ -107,7 +107,7 @@ class MachineDays:
 
     def during_break(self) -> list[Event]:
         """Return what was adopted or gone back from while the couple was broken, or within two hours after it."""
-        decided = self.decided(LoopAction.ADOPT, LoopAction.BACK, LoopAction.PROPOSE)
+        decided = self.decided(LoopAction.ADOPT, LoopAction.BACK)
         return [event for t_h, event in decided if self.times.break_h <= t_h <= self.times.repaired_h + 2.0]
 
     def figures(self) -> dict[str, Any]:
