@@ -61,8 +61,8 @@ MAGIC = b"\x89MCAP0\r\n"
 LONGEST = 64 * 2**20
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
-#: Number of notes on bytes without content that are kept.
-_MOST_NOTES = 20
+#: Number of notes on bytes without content, and of flaws, that are kept.
+_MOST_NOTES, _MOST_FLAWS = 20, 200
 
 _T = TypeVar("_T")
 
@@ -120,7 +120,7 @@ class McapChannel:
 
 
 class Flaw(StrEnum):
-    """Fault of an attachment or a metadata table, as text."""
+    """Fault of an attachment, a metadata table, a schema or a channel, as text."""
 
     WRONG_CRC = "its CRC is wrong"
     TWICE = "occurs twice"
@@ -142,7 +142,7 @@ class Contents:
     channels : dict of int to McapChannel
         By number.
     flaws : list of (str, Flaw)
-        Attachments and metadata with a flaw.
+        Attachments, metadata, schemas and channels with a flaw.
     chunked, ended : bool
         Whether the file has chunks, and whether it has its end.
     messages : int
@@ -381,8 +381,10 @@ class Container:
             fields.done()
         elif code == SCHEMA:
             number = fields.number("<H")
-            self._schemas[number] = (fields.text(), fields.text(), fields.bytes4())
+            described = (fields.text(), fields.text(), fields.bytes4())
             fields.done()
+            self._check_place(f"schema {described[0]}", is_there=number in self._schemas)
+            self._schemas[number] = described
             self.index.add_description(SCHEMA, number, body)
         elif code == CHANNEL:
             number, schema = fields.number("<H"), fields.number("<H")
@@ -391,6 +393,8 @@ class Container:
             self._used.add(schema)
             name, schema_encoding, data = self._schemas.get(schema, ("", "", b""))
             channel = McapChannel(topic, encoding, metadata, name, schema_encoding, data)
+            known = number in contents.channels or topic in (one.topic for one in contents.channels.values())
+            self._check_place(f"channel {topic}", is_there=known)
             if contents.channels.setdefault(number, channel) != channel:
                 raise Damaged(self.path, offset, f"a second channel {number}, {topic}")
             self.index.add_description(CHANNEL, number, body)
@@ -421,10 +425,19 @@ class Container:
             raise Damaged(self.path, offset, f"a record of kind {code}")
 
     def _keep(self, kept: dict[str, _T], name: str, value: _T, kind: str) -> None:
-        if self.contents.messages or name in kept:
-            self.contents.flaws.append((f"{kind} {name}", Flaw.TWICE if name in kept else Flaw.LATE))
-        else:
+        if self._check_place(f"{kind} {name}", is_there=name in kept):
             kept[name] = value
+
+    def _check_place(self, what: str, *, is_there: bool) -> bool:
+        """Return whether a part is in its place: a recorder writes each once, before the first message.
+
+        The chain names topics. A second channel of one, with a schema of its own, would show its messages differently.
+        """
+        if not (is_there or self.contents.messages):
+            return True
+        if len(self.contents.flaws) < _MOST_FLAWS:
+            self.contents.flaws.append((what, Flaw.TWICE if is_there else Flaw.LATE))
+        return False
 
     def _end(self, body: bytes) -> None:
         """Read the summary up to the end of the file."""

@@ -14,7 +14,17 @@ import pytest
 from compensator.audit.series import Audit, audit, summary
 from compensator.cli import main
 from compensator.recording.container import MAGIC
-from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, FOOTER, HEADER, SCHEMA, SUMMARY_OFFSET
+from compensator.recording.framing import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MESSAGE,
+    SCHEMA,
+    SUMMARY_OFFSET,
+)
 from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, Service
 
@@ -190,6 +200,34 @@ def test_a_schema_that_no_channel_has(tmp_path: Path) -> None:
     path.write_bytes(data[: at + length] + extra + data[at + length :])
     found = audit([path])
     assert found.clean and "outside_chain" in _codes(found) and "ghost" in " ".join(found.remarks)
+
+
+@pytest.mark.parametrize("topic", ["/offset", "/sneaky", ""])
+def test_a_schema_or_a_channel_after_the_first_message_is_found(tmp_path: Path, topic: str) -> None:
+    """Another channel of a topic would show its messages under another schema, which the chain does not name."""
+    live = Service(tmp_path).run(6)
+    path = live.recorder.path
+    assert path is not None
+    live.kill()
+    data, texts = path.read_bytes(), (b"forged", b"jsonschema", b'{"title": "y_offset in nm"}')
+    there = records(data)
+    body = struct.pack("<H", 999) + b"".join(struct.pack("<I", len(text)) + text for text in texts)
+    extra = struct.pack("<BQ", SCHEMA, len(body)) + body
+    if topic:
+        texts = (topic.encode(), b"json", b"")
+        channel = struct.pack("<HH", 77, 999) + b"".join(struct.pack("<I", len(text)) + text for text in texts)
+        extra += struct.pack("<BQ", CHANNEL, len(channel)) + channel
+    messages = [at for code, at, _ in there if code == MESSAGE]
+    middle = messages[len(messages) // 2]
+    own = [at for code, at, length in there if code == CHANNEL and b"/offset" in data[at : at + length]]
+    changed = bytearray(data)
+    for at in messages[len(messages) // 2 :]:
+        if topic == "/offset" and changed[at + 9 : at + 11] == data[own[0] + 9 : own[0] + 11]:
+            struct.pack_into("<H", changed, at + 9, 77)
+    path.write_bytes(bytes(changed[:middle]) + extra + bytes(changed[middle:]))
+    found = audit([path])
+    assert not found.clean and {finding.kind for finding in found.findings} == {"inserted"}, summary(found)
+    assert any("forged" in finding.line() for finding in found.findings)
 
 
 def _codes(found: Audit) -> list[str]:
