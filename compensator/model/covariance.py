@@ -15,8 +15,8 @@ the bit: a step that another observer has made has the bits that it would have h
 found is never changed; two threads that find the same step at once find the same. A process keeps 8 MB (`_KEPT_BYTES`)
 of steps, of all designs together. One that does not fit any more makes it forget all and begin again: until then a step
 is kept, whether or not its observer still is. Some 1,000 samples lead from rest to the steady state, as many after a
-gap: a step each, and one more for each sample that T_Q is late. A settled observer adds none. 8 MB are 2,800 steps of
-`quill`, 1,470 of a machine of five parts.
+gap: a step each. A settled observer adds none. 8 MB are 2,800 steps of `quill`, 1,470 of a machine of five parts. The
+way of a late T_Q from its past to the present (`run_on`) is one shared step, however many samples it has.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
 """
@@ -105,26 +105,47 @@ class _Step(NamedTuple):
     expected: _Expected
 
 
+class _Run(NamedTuple):
+    """Steps without T_Q one after the other: the last of them, and the gain of AT in each."""
+
+    last: _Step
+    gains: list[list[float]]
+
+
 class _SharedSteps:
     """The steps that a process keeps, and how much memory they take at most."""
 
     def __init__(self) -> None:
         self.steps: dict[tuple[object, ...], _Step] = {}
+        self.runs: dict[tuple[object, ...], _Run] = {}
         self.bytes = 0
 
     def add(self, key: tuple[object, ...], step: _Step) -> None:
         """Keep a step, and forget all others where there is no room for it."""
-        # The array, two lists of gains and one of a forecast; with its key 1,030 bytes were measured beside them.
-        size = 8 * step.p.size + 96 * len(step.p) + 1_100
+        self._make_room(_bytes_of(step))
+        self.steps[key] = step
+
+    def add_run(self, key: tuple[object, ...], run: _Run) -> None:
+        """Keep the steps from the past of a late T_Q to the present (as `add`)."""
+        # A list of gains is 56 bytes, each of them 32.
+        self._make_room(_bytes_of(run.last) + len(run.gains) * (32 * len(run.last.p) + 100))
+        self.runs[key] = run
+
+    def _make_room(self, size: int) -> None:
         if self.bytes + size > _KEPT_BYTES:
             self.clear()
-        self.steps[key] = step
         self.bytes += size
 
     def clear(self) -> None:
         """Forget all."""
         self.steps.clear()
+        self.runs.clear()
         self.bytes = 0
+
+
+def _bytes_of(step: _Step) -> int:
+    # The array, two lists of gains and one of a forecast; with its key 1,030 bytes were measured beside them.
+    return 8 * step.p.size + 96 * len(step.p) + 1_100
 
 
 _shared = _SharedSteps()
@@ -201,7 +222,7 @@ class Covariance:
         key = (self._key, self.p.base, self.started, r_at, r_tq, complete)
         step = _shared.steps.get(key)
         if step is None:
-            step = self._computed(r_at, r_tq, complete)
+            step = self._computed(r_at, r_tq, complete=complete)
             _shared.add(key, step)
         # After the first sample it is for the observer to say whether the next one moves it.
         self._set(step.p, step.expected if self.started else _Expected())
@@ -210,7 +231,7 @@ class Covariance:
             self._steady = self._steady_gains()
         return step.gains
 
-    def _computed(self, r_at: float | None, r_tq: float | None, complete: bool) -> _Step:
+    def _computed(self, r_at: float | None, r_tq: float | None, *, complete: bool) -> _Step:
         p = self.ahead()
         gains = Gains([], [])
         if r_at is not None:
@@ -312,10 +333,39 @@ class Covariance:
 
     # ------------------------------------------------------------------ from elsewhere
 
-    def follow(self, other: Covariance) -> None:
-        """Continue from where another of the same design is; settled or not is found by the next step."""
-        self._set(other.p, _Expected())
-        self.started = other.started
+    def run_on(self, past: Covariance, extras_at_k2: tuple[float | None, ...]) -> list[list[float]]:
+        """Continue from where another of the same design is, without T_Q, and return the gains of AT.
+
+        Parameters
+        ----------
+        past : Covariance
+            Where the other is.
+        extras_at_k2 : tuple of (float or None), length n
+            For each sample since then, the variance added to that of the sensor, K²; None where AT is missing.
+
+        Returns
+        -------
+        list of list of float, length n
+            Gains of AT in each sample; empty where it is missing.
+        """
+        key = (self._key, past.p.base, past.started, extras_at_k2)
+        run = _shared.runs.get(key)
+        if run is None:
+            run = self._computed_run(past, extras_at_k2)
+            _shared.add_run(key, run)
+        self._set(run.last.p, run.last.expected if past.started else _Expected())
+        self.started, self.settled, self.y_var = past.started, False, run.last.y_var
+        return run.gains
+
+    def _computed_run(self, past: Covariance, extras_at_k2: tuple[float | None, ...]) -> _Run:
+        self._set(past.p, _Expected())
+        self.started = past.started
+        gains = []
+        for extra in extras_at_k2:
+            step = self._computed(None if extra is None else self._design.at_var_k2 + extra, None, complete=False)
+            self._set(step.p, _Expected())
+            gains.append(step.gains.at)
+        return _Run(step, gains)
 
     def widen(self, ahead: Matrix) -> None:
         """Take the optimal filter's covariance after a sample, if the variance of y is larger with it.

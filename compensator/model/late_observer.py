@@ -84,14 +84,12 @@ class LateObserver(Observer):
                 self._x = self._moved(self._x)
                 self._correct(gain, at_k - self._x[self._a])
             return
-        covariance.follow(past._covariance)
-        gains = []
-        for at_k, extra in self._ambients:
+        extras = tuple(None if extra == _MISSING else extra for _, extra in self._ambients)
+        gains = covariance.run_on(past._covariance, extras)
+        for (at_k, extra), gain in zip(self._ambients, gains, strict=True):
             self._x = self._moved(self._x)
-            gain = covariance.step(None if extra == _MISSING else extra, None).at
             if extra != _MISSING:
                 self._correct(gain, at_k - self._x[self._a])
-            gains.append(gain)
         self._steady_for, self._steady_ahead = (past.covariance, gains) if complete else (None, [])
 
     def covariance_ahead(self) -> Matrix:

@@ -99,6 +99,25 @@ def test_one_that_is_still_at_rest_leaves_nothing_to_one_that_moves(method: str)
     assert first_without_t_q() == alone
 
 
+@pytest.mark.parametrize("method", ["kalman", "inverse"])
+def test_the_way_to_the_present_is_one_step(method: str) -> None:
+    """That of a late T_Q: kept for each past and each AT that was measured since or was missing."""
+    model, steps = late(with_method(method)), 40
+    covariance._shared.clear()
+    observers = [observer_of(model), observer_of(model)]
+    for observer in observers:
+        for i in range(steps):
+            observer.step(0.1, math.nan if i == 20 else 0.1)
+    assert 0 < len(covariance._shared.runs) <= steps
+    assert len(covariance._shared.steps) <= steps, "those between are not kept"
+    assert repr(observers[0].snapshot()) == repr(observers[1].snapshot())
+    assert observers[0].y_variance_um2 == observers[1].y_variance_um2
+    fresh = observer_of(model)
+    for _ in range(steps):
+        fresh.step(0.1, 0.1)
+    assert fresh.y_variance_um2 < observers[0].y_variance_um2, "AT that was missing is another way"
+
+
 def test_a_step_takes_no_more_memory_than_is_counted() -> None:
     for model in (QUILL, late(QUILL), direct("kalman")):
         observer = Observer(model)
