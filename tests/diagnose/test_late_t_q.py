@@ -56,9 +56,7 @@ def removed(found: Diagnosis, late: list[Scenario], others: list[Scenario]) -> f
     return (base - error(deployed, runs_from(columns)[0], true)) / possible
 
 
-@pytest.mark.parametrize(
-    ("lag_min", "delay_min", "least"), [(6.0, 0.0, 0.97), (2.0, 0.0, 0.97), (0.0, 2.0, 0.95), (0.0, 4.0, 0.9)]
-)
+@pytest.mark.parametrize(("lag_min", "delay_min", "least"), [(6.0, 0.0, 0.97), (0.0, 4.0, 0.9)])
 def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: float, least: float) -> None:
     late = sensor(lag_min, delay_min)
     columns, _, _ = record([late], 1100, 36.0)
