@@ -18,7 +18,7 @@ test check: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.ready
 	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.ready
 	$(BIN)/ruff format --check .
@@ -26,7 +26,7 @@ check: $(VENV)/.ready
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 soak: $(VENV)/.ready
 	$(BIN)/python -m tests.soak

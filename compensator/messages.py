@@ -19,6 +19,8 @@ from compensator.codes import SampleQuality, State
 
 #: Version of the messages.
 SCHEMA = 1
+#: What reading bytes as JSON raises that is not such a message: also nested thousands deep, which is no MsgspecError.
+UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
 
 class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):

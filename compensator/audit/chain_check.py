@@ -17,7 +17,7 @@ import msgspec
 from compensator.audit.findings import Fault
 from compensator.audit.result import RecordingAudit
 from compensator.codes import RecordingEnd
-from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
+from compensator.messages import SCHEMA, UNREADABLE, Chain, ChainLink, Seal, encode
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Contents, Flaw
 from compensator.recording.reading import RawRecord
@@ -26,7 +26,8 @@ from compensator.recording.signature import Verifier
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
 _TIME = re.compile(rb'"time_utc_ns":(\d{1,19}),')
-_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
+#: A message of the chain: or its hashes are no hexadecimal numbers.
+_UNREADABLE = (*UNREADABLE, ValueError)
 
 
 class _Prefixes(dict[str, bytes]):
@@ -231,7 +232,7 @@ class ChainCheck:
         """Return whether whole groups are missing before this one, or whether it is in the wrong place."""
         sequence, time_ns = message.sequence, message.log_time_ns
         present = {record.sequence for record in records}
-        if first > self._next and not present & set(range(self._next, first)):
+        if first > self._next and not any(self._next <= number < first for number in present):
             self._gaps[self._next] = (first - 1, time_ns)
             return True
         if first >= self._next:
@@ -252,43 +253,43 @@ class ChainCheck:
     def _find_unlisted(self, records: list[RawRecord], listed: list[ChainLink], before: bytes) -> None:
         """Report records that the chain does not list."""
         numbers = {entry.sequence for entry in listed}
-        unlisted = [record for record in records if record.sequence not in numbers]
         value = self.head
         prefix = 0
         for record in records:
             if record.sequence in numbers:
                 break
             value, prefix = chain.link(value, record.topic, record.body), prefix + 1
-        if prefix and value == before:
+        whole_group = bool(prefix) and value == before
+        if whole_group:
             last = records[prefix - 1]
             self._result.find(
                 Fault.MESSAGE_MISSING, topic="chain", sequence=last.sequence + 1, time_utc_ns=last.log_time_ns
             )
             self.head = value
-            unlisted = unlisted[prefix:]
         seen: set[int] = set()
-        for record in records:
-            if record in unlisted or record.sequence in seen:
+        for i, record in enumerate(records):
+            is_explained = whole_group and i < prefix
+            if (record.sequence not in numbers and not is_explained) or record.sequence in seen:
                 self._result.find(Fault.NOT_LISTED, record)
             seen.add(record.sequence)
 
     def _find_missing(self, records: list[RawRecord], listed: list[ChainLink], message: RawRecord) -> None:
         """Report records that are listed but missing, or in another order."""
-        present = [record.sequence for record in records]
+        there = {record.sequence: record for record in reversed(records)}
         for entry in listed:
-            if entry.sequence not in present:
+            if entry.sequence not in there:
                 self._result.find(
                     Fault.LISTED_MISSING,
                     topic=entry.topic,
                     sequence=entry.sequence,
                     time_utc_ns=message.log_time_ns,
                 )
-        numbers = [entry.sequence for entry in listed if entry.sequence in present]
-        order = [number for number in dict.fromkeys(present) if number in numbers]
-        for wanted, found in zip(numbers, order, strict=False):
+        stated = [entry.sequence for entry in listed if entry.sequence in there]
+        numbers = set(stated)
+        order = [number for number in dict.fromkeys(record.sequence for record in records) if number in numbers]
+        for wanted, found in zip(stated, order, strict=False):
             if wanted != found:
-                record = next(record for record in records if record.sequence == found)
-                self._result.find(Fault.EXCHANGED, record, record=wanted)
+                self._result.find(Fault.EXCHANGED, there[found], record=wanted)
                 return
 
     def _find_changed(
@@ -318,7 +319,7 @@ class ChainCheck:
         result = self._result
         try:
             seal = msgspec.json.decode(record.data, type=Seal)
-        except (msgspec.MsgspecError, UnicodeDecodeError):
+        except UNREADABLE:
             result.find(Fault.UNREADABLE_MESSAGE, record)
             return
         result.seal = "" if seal.reason == "hour" else seal.reason

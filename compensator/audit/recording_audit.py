@@ -14,6 +14,7 @@ from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.codes import AuditFinding, RecordingEnd
 from compensator.errors import CompensatorError, DataError
+from compensator.messages import UNREADABLE
 from compensator.recording.container import Container, Damaged, Torn
 from compensator.recording.reading import RawRecord, groups_of
 from compensator.recording.signature import Verifier
@@ -211,6 +212,6 @@ def _covers_others(rest: bytes) -> bool:
         return True
     try:
         msgspec.json.decode(rest[_MESSAGE_HEAD:])
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+    except UNREADABLE:
         return False
     return rest[:1] == _MESSAGE

@@ -13,7 +13,7 @@ from compensator.audit.result import RecordingAudit
 from compensator.codes import Reason
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
-from compensator.messages import Event, Message, Offset, degraded, encode
+from compensator.messages import UNREADABLE, Event, Message, Offset, degraded, encode
 from compensator.messages_axes import AxisOffset, recorded_offsets
 from compensator.recording.container import Contents
 from compensator.recording.reading import RawRecord
@@ -236,7 +236,7 @@ def _of_one_side(name: str = "message", *, recorded: bytes = b"", recomputed: An
     text = recorded.decode("utf-8", "replace") if recorded else None
     try:
         table = msgspec.json.decode(recorded) if recorded else msgspec.to_builtins(recomputed)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except UNREADABLE:
         table = None
     if isinstance(table, dict) and table and all(isinstance(one, dict) for one in table.values()):
         sides = ((one, None) if recorded else (None, one) for one in table.values())
@@ -259,7 +259,7 @@ def differing_fields(recorded: bytes, recomputed: bytes) -> Iterator[Field]:
     """Yield the fields in which two JSON messages differ, by their path."""
     try:
         there = msgspec.json.decode(recorded)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except UNREADABLE:
         there = repr(recorded[:80])
     found = list(_differing("", there, msgspec.json.decode(recomputed)))
     if found:

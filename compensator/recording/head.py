@@ -17,6 +17,7 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.errors import DataError, UsageError
+from compensator.messages import UNREADABLE
 from compensator.recording.reading import last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
 
@@ -167,7 +168,7 @@ def read_head(path: Path, verifier: Verifier | None = None) -> Head:
         for end in head.ends:
             for value in end.accepted:
                 bytes.fromhex(value)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+    except (*UNREADABLE, ValueError) as error:
         raise UsageError(f"{path}: no head of a chain: {error}") from error
     if verifier is not None and not verifier.made(head.signed_bytes(), head.signature):
         raise UsageError(f"{path}: not signed with the given key")

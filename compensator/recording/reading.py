@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from compensator.errors import DataError, UsageError
-from compensator.messages import MESSAGES, Chain
+from compensator.messages import MESSAGES, UNREADABLE, Chain
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names_axes, topic_of
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
@@ -228,7 +228,7 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: RawRecord, file: str)
     """
     try:
         return decoder.decode(record.data)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise DataError(f"{file}: /{record.topic} record {record.sequence}: {error}") from error
 
 
@@ -317,7 +317,7 @@ def values_of(path: Path) -> set[bytes]:
 def _linked(path: Path) -> Iterator[tuple[RawRecord, bytes]]:
     """Yield the first message of the chain and every record, each with the value of the chain that it makes."""
     value = b""
-    with Container(path) as container, suppress(Damaged, msgspec.MsgspecError, ValueError):
+    with Container(path) as container, suppress(Damaged, *UNREADABLE, ValueError):
         for record in records_of(container):
             if record.topic == "chain" and not value:
                 first = msgspec.json.decode(record.data, type=Chain)

@@ -13,7 +13,7 @@ from compensator.clock import Clock
 from compensator.codes import ProbeCode
 from compensator.errors import ServiceError
 from compensator.events import CommandName, EventKind
-from compensator.messages import Probe
+from compensator.messages import UNREADABLE, Probe
 from compensator.service.compensation import Compensation
 from compensator.service.event_log import EventLog
 from compensator.service.loop.live import LiveLoop
@@ -244,7 +244,7 @@ class Commands:
         """Return the arguments of an acceptable command."""
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        except UNREADABLE as error:
             raise ServiceError(f"{name}: the payload is not a JSON object") from error
         mode = arguments.get("mode", "auto")
         if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):

@@ -19,7 +19,7 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.codes import Remark, ServiceWarning
-from compensator.messages import Offset, number
+from compensator.messages import UNREADABLE, Offset, number
 
 log = logging.getLogger("compensator")
 
@@ -115,7 +115,7 @@ class OffsetCheckpoint:
                 return None
             try:
                 checkpointed = msgspec.json.decode(file.read(_LONGEST), type=CheckpointedOffset)
-            except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            except UNREADABLE as error:
                 self._refuse(str(error))
                 return None
         if not abs(checkpointed.y_offset_um) <= offset_max_um or checkpointed.seq < 0:

@@ -17,6 +17,7 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
+from compensator.messages import UNREADABLE
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
 from compensator.service.plausibility import JumpState, PlausibilityState
@@ -176,7 +177,7 @@ def decode_state(data: bytes) -> CompensationState:
     try:
         # Not strict, so that a string may be a number.
         state = msgspec.json.decode(data, type=CompensationState, strict=False)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+    except (*UNREADABLE, ValueError) as error:
         raise DataError(f"state: {error}") from error
     if state.schema != STATE_SCHEMA:
         raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")

@@ -12,7 +12,7 @@ from msgspec import UNSET, UnsetType
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
-from compensator.messages import SCHEMA, Candidate, EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages import SCHEMA, UNREADABLE, Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
 from compensator.watch.axes import axis_snapshot, worst
 from compensator.watch.cutting import Headline, headline
@@ -76,7 +76,7 @@ def decoded(kind: str, payload: bytes) -> Any:
     try:
         decoder = _OF_SEVERAL if kind == "offset" and names_axes(payload) else _DECODERS[kind]
         message: Any = decoder.decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise Malformed(f"{kind}: {error}") from error
     if message.schema != SCHEMA:
         raise Malformed(f"{kind}: schema = {message.schema}, expected {SCHEMA}")

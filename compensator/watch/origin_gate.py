@@ -14,10 +14,12 @@ from collections.abc import Collection
 from contextlib import suppress
 from typing import Any
 
+from compensator.watch.clients import CONNECTIONS, REQUEST_S, Within
+
 #: Origins of the viewer itself: its page, and its desktop application, whose page is a file.
 VIEWERS = ("https://app.foxglove.dev", "file://")
-#: Largest head of a request, bytes; time for it, s; connections at once.
-HEAD_BYTES, HEAD_S, CONNECTIONS = 16_384, 5.0, 20
+#: Largest head of a request, bytes.
+HEAD_BYTES = 16_384
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _END = b"\r\n\r\n"
 
@@ -100,17 +102,17 @@ class _Passing(socketserver.BaseRequestHandler):
             if not permitted(head.partition(_END)[0], self.server.origins):
                 self.request.sendall(_REFUSED)
                 return
-            with socket.create_connection(self.server.inner, timeout=HEAD_S) as inner:
+            with socket.create_connection(self.server.inner, timeout=REQUEST_S) as inner:
                 inner.sendall(head)
                 self._pass(inner)
         finally:
             self.server.free.release()
 
     def _head(self) -> bytes:
-        self.request.settimeout(HEAD_S)
+        within = Within(self.request, REQUEST_S)
         head = b""
         with suppress(OSError):
-            while _END not in head and len(head) < HEAD_BYTES and (more := self.request.recv(4096)):
+            while _END not in head and len(head) < HEAD_BYTES and (more := within.read(4096)):
                 head += more
         return head
 

@@ -12,6 +12,7 @@ import errno
 import hashlib
 import hmac
 import html
+import io
 import json
 import re
 import socket
@@ -29,6 +30,7 @@ from compensator import __version__
 from compensator.clock import NS
 from compensator.codes import SUFFIX_WORDS, WORDS
 from compensator.errors import ServiceError, UsageError
+from compensator.watch.clients import CONNECTIONS, REQUEST_S, Within
 from compensator.watch.history import state_intervals
 from compensator.watch.shop import Shop, headline
 
@@ -174,6 +176,24 @@ class _Server(ThreadingHTTPServer):
     answer: Callable[[str, dict[str, list[str]]], tuple[str, bytes] | None]
     token: str = ""
 
+    def __init__(self, *args: Any) -> None:
+        self._free = threading.BoundedSemaphore(CONNECTIONS)
+        super().__init__(*args)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, unless too many are being answered."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and make room for another one."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing about a browser that was closed before it had its answer."""
         if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
@@ -189,8 +209,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     server: _Server
     server_version, sys_version = "compensator", ""
-    #: Timeout of a silent client, s.
-    timeout = 10.0
+    timeout = REQUEST_S
+
+    def setup(self) -> None:
+        """Read the request within its time."""
+        super().setup()
+        self.rfile = io.BufferedReader(Within(self.connection, self.timeout))
 
     def do_GET(self) -> None:
         """Answer a request."""

@@ -94,8 +94,8 @@ async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by
         (False, "worse"), (True, "worse"), (True, "better"),
     ]  # fmt: skip
     assert told[0]["comparison"] == json.loads(json.dumps(found, allow_nan=False))
-    # What was foreseen of the offset is what it does.
-    assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], abs=1.0)
+    # What was foreseen of the offset is what it does, but for the minutes in which both were computed.
+    assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], rel=0.15)
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert check_files(machine) == len(machine.outcomes)
     audited = audit(recordings(machine.recordings, MACHINE))

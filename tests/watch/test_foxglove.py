@@ -12,8 +12,10 @@ from typing import Any
 import pytest
 
 from compensator.errors import ServiceError
+from compensator.watch import origin_gate
 from compensator.watch.foxglove import FoxgloveServer, topic_of
 from tests.watch.heard import START_NS, estimate, event, offset, sample
+from tests.watch.slow import drip
 
 pytest.importorskip("foxglove")
 connect = pytest.importorskip("websockets.sync.client").connect
@@ -131,6 +133,12 @@ def test_the_viewer_and_a_viewer_of_ones_own_can() -> None:
             address = f"ws://127.0.0.1:{server.port}"
             with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None, origin=origin) as viewer:
                 assert json.loads(viewer.recv(timeout=30))["op"] == "serverInfo"
+
+
+def test_who_sends_byte_after_byte_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(origin_gate, "REQUEST_S", 0.3)
+    with FoxgloveServer("shop", 0) as server, socket.create_connection(("127.0.0.1", server.port)) as slow:
+        drip(slow, 0.3)
 
 
 def test_what_is_no_request_does_not_keep_others_out() -> None:

@@ -7,8 +7,10 @@ import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +20,11 @@ from compensator.clock import NS
 from compensator.codes import WORDS
 from compensator.commands.watch import _token
 from compensator.errors import ServiceError, UsageError
+from compensator.watch.clients import CONNECTIONS
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+from tests.watch.slow import drip
 
 STATUS = {"connected": True, "where": "tcp/127.0.0.1:7447", "prefix": "shop", "ignored": 0}
 EVIL = '<img src=x onerror="document.title=1">'
@@ -258,6 +262,26 @@ def test_a_channel_that_is_not_well_stands_above_the_numbers(tmp_path: Path) -> 
         't_q_degc: <a href="#word=open_circuit">open_circuit</a>: The thermocouple or its wiring is broken. <b>Action'
     )
     assert said in text and text.index(said) < text.index('<dl id="now"')
+
+
+def test_slow_clients_hold_a_place_for_the_time_of_one_request(
+    server: PageServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who sends byte after byte is dropped, and more than are answered at once are turned away; then all is well."""
+    assert server._server is not None
+    monkeypatch.setattr(server._server.RequestHandlerClass, "timeout", 0.5)
+    address = server._server.server_address[:2]
+    with ExitStack() as stack:
+        slow = [stack.enter_context(socket.create_connection(address)) for _ in range(CONNECTIONS)]
+        with socket.create_connection(address) as one_more:
+            one_more.settimeout(30)
+            with suppress(ConnectionError):
+                assert one_more.recv(1) == b"", "turned away"
+        drip(slow[0], 0.5)
+        for one in slow[1:]:
+            one.settimeout(30)
+            assert one.recv(1) == b""
+    assert ask(server, "/shop.json")[0] == 200
 
 
 def test_a_browser_that_closes_early_leaves_no_traceback(server: PageServer, capfd: pytest.CaptureFixture[str]) -> None:

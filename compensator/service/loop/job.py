@@ -11,7 +11,7 @@ from compensator.atomic_write import replace_file
 from compensator.errors import DataError
 from compensator.events import EventKind
 from compensator.input_file import RESULT_BYTES, read_file
-from compensator.messages import Event, Offset, Probe, Sample
+from compensator.messages import UNREADABLE, Event, Offset, Probe, Sample
 from compensator.recording.reading import messages, recordings
 
 #: Files in the folder of a diagnosis: the job with the calibrated model; and the result, written last.
@@ -68,7 +68,7 @@ def read_job(path: Path) -> Job:
     """
     try:
         return msgspec.json.decode(read_file(path, RESULT_BYTES), type=Job)
-    except (OSError, msgspec.MsgspecError) as error:
+    except (OSError, *UNREADABLE) as error:
         raise DataError(f"{path}: {error}") from error
 
 

@@ -23,6 +23,7 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import CompensatorError
+from compensator.messages import UNREADABLE
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result
 from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.weighing import FAILED, Diagnosed
@@ -145,7 +146,7 @@ def _read(work: Path) -> Diagnosed:
     try:
         result = msgspec.json.decode(_bytes_of(work / RESULT), type=Result)
         model = _bytes_of(work / "model.toml") if result.effects else None
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except (OSError, *UNREADABLE) as error:
         return failed(f"its result cannot be read: {error}")
     if result.verdict == FAILED:
         return failed(result.needs)

@@ -8,6 +8,7 @@ import msgspec
 
 from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
+from compensator.messages import UNREADABLE
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
@@ -207,5 +208,5 @@ def decode_loop(data: bytes) -> LoopState:
         if schema != STATE_SCHEMA:
             raise DataError(f"loop.json: schema = {schema}, expected {STATE_SCHEMA}")
         return msgspec.json.decode(data, type=LoopState)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise DataError(f"loop.json: {error}") from error

@@ -10,7 +10,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.codes import ProbeCode, Reason
 from compensator.errors import ServiceError
-from compensator.messages import SCHEMA, Probe, ProbeRequest, number
+from compensator.messages import SCHEMA, UNREADABLE, Probe, ProbeRequest, number
 from compensator.model.correction import ProbeVerdict
 
 _REQUEST = msgspec.json.Decoder(ProbeRequest)
@@ -114,7 +114,7 @@ def read_probe(payload: bytes) -> ProbeRequest:
     """
     try:
         request = _REQUEST.decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError, OverflowError) as error:
+    except (*UNREADABLE, ValueError, OverflowError) as error:
         raise ProbeRefused(ProbeCode.MALFORMED, f"probe: {error}") from error
     if request.schema != SCHEMA:
         raise ProbeRefused(ProbeCode.MALFORMED, f"probe: schema = {request.schema}, expected {SCHEMA}")

@@ -17,6 +17,7 @@ from compensator.atomic_write import replace_file
 from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError, ServiceError
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
+from compensator.messages import UNREADABLE
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, model_of
 
@@ -128,7 +129,7 @@ class ModelStore:
             return _Contents(configured_sha256=self._configured_sha256)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}") from error
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except UNREADABLE as error:
             raise ServiceError(f"{path}: {error}; remove it to use the configured model") from error
         if contents.configured_sha256 != self._configured_sha256:
             return _Contents(configured_sha256=self._configured_sha256, history=contents.history)
