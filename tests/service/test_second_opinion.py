@@ -62,6 +62,8 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Measured:
 
 async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by_force(tmp_path: Path) -> None:
     machine = Measured(tmp_path)
+    # What is foreseen of the offset is compared below with what it does: the machine hardly moves on meanwhile.
+    machine.promises.patience_s = 10.0
     wrong = gain(0.4)
     refused = machine.at_sample[900] = Asked(machine, "adopt", payload(wrong))
     forced = Asked(machine, "adopt", payload(wrong, force=True))
@@ -94,8 +96,8 @@ async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by
         (False, "worse"), (True, "worse"), (True, "better"),
     ]  # fmt: skip
     assert told[0]["comparison"] == json.loads(json.dumps(found, allow_nan=False))
-    # What was foreseen of the offset is what it does, but for the minutes in which both were computed.
-    assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], rel=0.15)
+    # What was foreseen of the offset is what it does.
+    assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], rel=0.02)
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert check_files(machine) == len(machine.outcomes)
     audited = audit(recordings(machine.recordings, MACHINE))
