@@ -61,6 +61,22 @@ def signals(seed, hours):
     return n, columns, heat, ambient, y_dtf, y_tdtf, lfilter(*tustin(TTF, TTF_POLES), heat)
 
 
+def mistimed(factor):
+    """The 20.92 min mode of the DTF with another time constant, gain at rest kept."""
+
+    def act(s):
+        from scipy.signal import cont2discrete
+
+        new_tau = 20.92 * factor
+        num = np.array(list(reversed([0.0001065, 0.04279, -0.00769, -0.01453])))
+        den = np.poly([-1 / 1.5657, -1 / 291.85, -1 / new_tau])
+        num = num * (1 / 1.5657 / 291.85 / new_tau) / 0.0001046
+        b, a, _ = cont2discrete((num, den), 1.0, method="bilinear")
+        return lfilter(np.squeeze(b), a, s[2]) - s[4]
+
+    return Scenario(place=("dynamics", "DTF", ""), act=act)
+
+
 def draw(kind, seed, size_um=None):
     """Draw an effect of a kind."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
@@ -81,18 +97,7 @@ def draw(kind, seed, size_um=None):
     t_step, period, phase = rng.uniform(0.25, 0.75), rng.uniform(20.0, 180.0), rng.uniform(0, 6.28)
     switch = np.cumsum(rng.uniform(60.0, 240.0, 40))
     width = size * rng.uniform(1.0, 2.0)
-    new_tau = 20.92 * rng.choice([0.7, 1.4])
-
-    def mistimed(s):
-        # The 20.92 min mode of the DTF at another time constant, gain at rest kept.
-        from scipy.signal import cont2discrete
-
-        poles = [-1 / 1.5657, -1 / 291.85]
-        num = np.array(list(reversed([0.0001065, 0.04279, -0.00769, -0.01453])))
-        den = np.poly([*poles, -1 / new_tau])
-        num = num * (1 / 1.5657 / 291.85 / new_tau) / 0.0001046
-        b, a, _ = cont2discrete((num, den), 1.0, method="bilinear")
-        return lfilter(np.squeeze(b), a, s[2]) - s[4]
+    changed = rng.choice([0.7, 1.4])
 
     def play(y):
         at, out = 0.0, []
@@ -114,7 +119,7 @@ def draw(kind, seed, size_um=None):
         "gain DTF": (("gain", "DTF", ""), lambda s: fixed("a", s[4])),
         "gain TDTF": (("gain", "TDTF", ""), lambda s: fixed("a", s[5])),
         "missing mode": (("dynamics", "DTF", ""), lambda s: fixed("a", lag(s[2], tau))),
-        "mistimed": (("dynamics", "DTF", ""), mistimed),
+        "mistimed": (("dynamics", "DTF", ""), mistimed(changed).act),
         "late path": (("delay", "DTF", ""), lambda s: late(s[4], max(2, delay // 4)) - s[4]),
         "late sensor": (("delay", "TTF", ""), lambda s: np.zeros(s[0])),
         "nonlinear": (("nonlinear", "DTF", ""), lambda s: fixed("a", s[4] ** 2)),

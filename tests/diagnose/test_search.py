@@ -21,7 +21,7 @@ from compensator.model.model_file import load_model
 from compensator.report.diagnosis import tone_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.effects.mechanical import StickSlip
-from tests.diagnose.scenarios import KINDS, draw, record
+from tests.diagnose.scenarios import KINDS, draw, mistimed, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -40,6 +40,14 @@ def named(scenarios, seed, hours=24.0, **noise):
 def test_one_effect_is_named_and_no_second_invented(kind):
     scenario = draw(kind, 100)
     assert named([scenario], 1100) == ([scenario.place] if scenario.place else [])
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.06, 1.24])
+def test_a_time_constant_that_changed_a_little_is_found(factor):
+    """Its response grows with the change, which no amplitude takes up: far from it a search does not begin."""
+    (term,) = search([mistimed(factor)], 1300)
+    assert term.hypothesis.place == ("dynamics", "DTF", "")
+    assert term.named["tau_min"] == pytest.approx(20.92 * factor, rel=0.03)
 
 
 @pytest.mark.parametrize("pair", [("input", "step"), ("gain DTF", "drift"), ("play", "input")])

@@ -10,6 +10,7 @@ represent any such difference.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, Lag, S
-from compensator.model.effects.hypothesis import Context, Hypothesis, numbered, proposes
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 
@@ -105,6 +106,11 @@ class ChangedPaths(BankEffect, Effect):
         )
 
 
+#: Changes of a time constant that the search begins with. The response grows with them: of two neighbours the larger
+#: one is never so large that in the place of a change between them it explains less than nothing.
+CHANGES = (0.03, 0.06, 0.12, 0.25, 0.5)
+
+
 @proposes
 def modes(context: Context) -> Iterator[Hypothesis]:
     """Propose a further mode of every path, each of its modes that is slow enough to be seen, any change of both."""
@@ -117,7 +123,7 @@ def modes(context: Context) -> Iterator[Hypothesis]:
         for tau in context.taus_min.get(path, ()):
             if tau > 2.0 * context.period_min:
                 mistimed = MistimedMode(path=path, tau_min=tau, instead_of_min=tau)
-                yield Hypothesis(effect=mistimed, form=f"mistimed {tau:.3g}", free=(context.tau(),))
+                yield Hypothesis(effect=mistimed, form=f"mistimed {tau:.3g}", free=(_near(context.tau(), tau),))
     taus = context.bank_min
     ones = (1.0,) * len(taus)
     names = f"change_um_per_{context.drive_unit('DTF')}", "change_ambient_um_per_k"
@@ -125,3 +131,10 @@ def modes(context: Context) -> Iterator[Hypothesis]:
     both = ChangedPaths(tau_min=taus, gain=ones, gain_ambient=ones)
     sizes = tuple(np.repeat([context.gain_change("DTF"), context.gain_change("TDTF")], len(taus)).tolist())
     yield Hypothesis(effect=both, form="changed", amplitudes=amplitudes, sizes=sizes)
+
+
+def _near(free: Free, tau_min: float) -> Free:
+    """Return a time constant whose search also begins with small changes of one that it may have instead."""
+    near = [tau_min * (1.0 + change) ** sign for change in CHANGES for sign in (-1, 1)]
+    grid = {*free.grid, *(tau for tau in near if free.low < tau < free.high)}
+    return dataclasses.replace(free, grid=tuple(sorted(grid)))
