@@ -1,4 +1,4 @@
-"""Leaves out readings that a sensor cannot have meant: single wrong ones, and those at the end of its range."""
+"""Leaves out readings that a sensor cannot have meant: one or two wrong ones, and those at the end of its range."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from compensator.arrays import Indices, Mask, Vector
 from compensator.codes import DataRemark, Remark
@@ -15,8 +16,10 @@ from compensator.data.runs import is_sparse, noise_std
 from compensator.data.screening import DEAD_SAMPLES, LIVELY_STILL, LIVELY_TURNS
 from compensator.errors import DataError
 
-#: A single reading this many noise deviations away from what is beside it is an outlier.
+#: A reading this many noise deviations away from what is beside it is an outlier.
 OUTLIER_DEVIATIONS = 12.0
+#: So many outliers may follow each other where a signal is slow: what disturbs one reading may reach into the next.
+IN_A_ROW = 2
 #: What is beside an outlier is together within this share of its distance.
 TOGETHER = 0.3
 #: At an end of a record so many samples beside a reading have to be together.
@@ -80,7 +83,8 @@ def cleaned(name: str, records: Sequence[SampledRecord]) -> tuple[tuple[SampledR
             if column == "heat_w":
                 continue
             slow = column.endswith(SLOW) and not is_sparse(values)
-            kept, count = without_outliers(values, first=slow and not is_switched, last=slow)
+            row = IN_A_ROW if slow else 1
+            kept, count = without_outliers(values, first=slow and not is_switched, last=slow, in_a_row=row)
             if count:
                 remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {count} outlier(s) left out."))
             if column.endswith(SLOW) and (stand := stand_at_limit(kept)):
@@ -112,11 +116,13 @@ def refuse_at_limit(name: str, record: SampledRecord) -> None:
             )
 
 
-# ---------------------------------------------------------------------- single readings
+# ---------------------------------------------------------------------- wrong readings
 
 
-def without_outliers(values: Vector, *, first: bool = False, last: bool = False) -> tuple[Vector, int]:
-    """Replace outliers, single readings far from all that is beside them, by NaN.
+def without_outliers(
+    values: Vector, *, first: bool = False, last: bool = False, in_a_row: int = 1
+) -> tuple[Vector, int]:
+    """Replace outliers, readings far from all that is beside them, by NaN.
 
     A step stays: its samples are near one of their neighbours. The first and last reading of a stretch have neighbours
     on one side only; they are outliers where these are together, and the signal has no such step elsewhere.
@@ -127,6 +133,8 @@ def without_outliers(values: Vector, *, first: bool = False, last: bool = False)
         A record; NaN where missing.
     first, last : bool
         Whether the first and last reading of each stretch without a long gap may be outliers, too.
+    in_a_row : int
+        Most outliers that follow each other, all on one side.
 
     Examples
     --------
@@ -142,11 +150,7 @@ def without_outliers(values: Vector, *, first: bool = False, last: bool = False)
     noise = noise_std(v)
     # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
     limit = OUTLIER_DEVIATIONS * noise + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
-    before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
-    across = np.abs(v[2:] - v[:-2])
-    apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)
-    apart &= across < TOGETHER * np.minimum(np.abs(before), np.abs(after))
-    outliers = known[1:-1][apart]
+    outliers = known[np.concatenate([_apart(v, count, limit) for count in range(1, in_a_row + 1)])]
     if noise > 0.0:  # what was computed has no wrong readings, but may begin with a step
         known = np.setdiff1d(known, outliers)
         ends = [end for end, asked in ((_first_alone, first), (_last_alone, last)) if asked]
@@ -156,6 +160,17 @@ def without_outliers(values: Vector, *, first: bool = False, last: bool = False)
     kept = values.copy()
     kept[outliers] = np.nan
     return kept, int(outliers.size)
+
+
+def _apart(v: Vector, count: int, limit: float) -> Indices:
+    """Return where so many readings in a row are far from both that are beside them, and on one side of these."""
+    rows = sliding_window_view(v, count)[1:-1]
+    before, after = v[: -count - 1], v[count + 1 :]
+    above = np.min(rows, axis=1) - np.maximum(before, after)
+    below = np.minimum(before, after) - np.max(rows, axis=1)
+    distance = np.maximum(above, below)
+    apart = (distance > limit) & (np.abs(after - before) < TOGETHER * distance)
+    return (np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()
 
 
 def _first_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:

@@ -22,6 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import STEP, RandomColumns
 from compensator.diagnose.points import Points, Rest, lags_of_paths
+from compensator.diagnose.refitted_paths import with_fewer_lags
 from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
@@ -101,7 +102,7 @@ class Background:
                 np.kron(np.eye(len(inputs)), np.vstack([np.eye(len(taus) - 1), -np.ones(len(taus) - 1)]))
             )
         self.columns = of_gains @ self.made_of if recent else of_gains
-        self._of_gains = of_gains
+        self._of_gains, self._period_min = of_gains, context.period_min
         self.groups = np.repeat(np.arange(len(inputs)), len(taus) - recent)
         # The sizes of the base's own paths are known apart from those of channels.
         self.is_path = np.arange(len(inputs)) < paths
@@ -121,6 +122,15 @@ class Background:
             Most evaluations.
         """
         return _Problem(self, points, explained).solved(start, steps)
+
+    def as_paths(self, banks: Matrix) -> Matrix:
+        """Return gains, shape (inputs, lags), with those of the base's own paths as a model can have them."""
+        taus_min, period_min = self.template.taus_min, self._period_min
+        found = banks.copy()
+        for i in np.flatnonzero(self.is_path).tolist():
+            own = self._of_gains[:, i * len(taus_min) : (i + 1) * len(taus_min)]
+            found[i] = with_fewer_lags(banks[i], taus_min, period_min, own)
+        return found
 
     def response(self, effect: Regression) -> Vector:
         """Return what a regression over these channels adds to y on every sample, µm."""
@@ -211,11 +221,12 @@ class _Problem:
         sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
         background = self.background
+        banks = (background.made_of @ gains).reshape(-1, len(background.template.taus_min))
+        if self.points.evidence.free_paths:
+            banks = background.as_paths(banks)
         effect = dataclasses.replace(
             background.template,
-            gains=tuple(
-                map(tuple, (background.made_of @ gains).reshape(-1, len(background.template.taus_min)).tolist())
-            ),
+            gains=tuple(map(tuple, banks.tolist())),
             std_factor=background.directions(self.points, root),
         )
         return Regressed(

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compensator.arrays import Mask, Vector
+from compensator.arrays import Mask, Matrix, Vector
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: A fitted path has no more lags than this, and fewer where this share of its step response is all that it loses.
+#: A fitted path has no more lags than this, and fewer where this share of its responses is all that it loses.
 PATH_LAGS, PATH_EXACT = 4, 0.003
 
 
@@ -42,28 +42,57 @@ def with_paths(model: ThermalModel, found: Regression) -> tuple[ThermalModel, Re
     return changed, rest
 
 
-def _function(found: Regression, channel: int, period_s: float) -> SampledTransferFunction:
-    """Return a channel's filter bank as one transfer function with as few of its lags as its step response needs.
+def with_fewer_lags(gains: Vector, taus_min: Sequence[float], period_min: float, response: Matrix) -> Vector:
+    """Return gains of a path's filter bank with as few lags as its response needs.
 
-    With all of them poles lie so close that the observer's covariance has no valid digit.
+    With all of them poles lie so close that the observer's covariance has no valid digit. What is left out shows in the
+    step response or on the record, where heat and ambient may nearly cancel.
+
+    Parameters
+    ----------
+    gains : numpy.ndarray, shape (lags,)
+        The gain behind each lag.
+    taus_min : sequence of float
+        The lags, min; 0 is undelayed.
+    period_min : float
+        Sample period, min.
+    response : numpy.ndarray, shape (n, lags)
+        The record behind each lag.
     """
-    poles = np.array([Lag(tau, period_s / 60.0).pole if tau > 0.0 else 0.0 for tau in found.taus_min])
-    is_lag = np.array(found.taus_min) > 0.0
-    count = np.arange(round(3.0 * max(found.taus_min) * 60.0 / period_s))[:, None]
+    if not np.any(gains):
+        return gains
+    poles, is_lag = _poles(taus_min, period_min), np.array(taus_min) > 0.0
+    count = np.arange(round(3.0 * max(taus_min) / period_min))[:, None]
     steps = np.where(is_lag, 1.0 - poles**count * (1.0 + poles) / 2.0, 1.0)
-    wanted = steps @ np.array(found.gains[channel])
+    sizes = [max(float(np.linalg.norm(each @ gains)), 1e-12) for each in (steps, response)]
+    table = np.concatenate([each / size for each, size in zip((steps, response), sizes, strict=True)])
+    wanted = table @ gains
     lagged, direct = np.flatnonzero(is_lag).tolist(), np.flatnonzero(~is_lag).tolist()
-    square, products = steps.T @ steps, steps.T @ wanted
+    square, products = table.T @ table, table.T @ wanted
     kept: tuple[float, tuple[int, ...], Vector] = (np.inf, (), np.zeros(0))
     for size in range(1, min(PATH_LAGS, len(lagged)) + 1):
         for some in itertools.combinations(lagged, size):
             which = (*direct, *some)
-            gains = np.linalg.solve(square[np.ix_(which, which)], products[list(which)])
-            left = float(np.linalg.norm(wanted - steps[:, which] @ gains))
-            kept = min(kept, (left, which, gains), key=lambda each: each[0])
+            fewer = np.linalg.solve(square[np.ix_(which, which)], products[list(which)])
+            left = float(np.linalg.norm(wanted - table[:, which] @ fewer))
+            kept = min(kept, (left, which, fewer), key=lambda each: each[0])
         if kept[0] <= PATH_EXACT * float(np.linalg.norm(wanted)):
             break
-    return _summed(poles, is_lag, kept[1], kept[2], period_s)
+    found = np.zeros(gains.size)
+    found[list(kept[1])] = kept[2]
+    return found
+
+
+def _poles(taus_min: Sequence[float], period_min: float) -> Vector:
+    return np.array([Lag(tau, period_min).pole if tau > 0.0 else 0.0 for tau in taus_min])
+
+
+def _function(found: Regression, channel: int, period_s: float) -> SampledTransferFunction:
+    """Return a channel's filter bank as one transfer function of the lags that have a gain."""
+    gains = np.array(found.gains[channel])
+    is_lag = np.array(found.taus_min) > 0.0
+    which = [i for i in range(gains.size) if gains[i] or not is_lag[i]]
+    return _summed(_poles(found.taus_min, period_s / 60.0), is_lag, which, gains[which], period_s)
 
 
 def _summed(
@@ -71,7 +100,7 @@ def _summed(
 ) -> SampledTransferFunction:
     """Return a sum of lags and a direct part as one transfer function."""
     lags = [i for i in which if is_lag[i]]
-    denominator = np.poly(poles[lags])
+    denominator = np.atleast_1d(np.poly(poles[lags]))
     numerator = np.zeros(len(lags) + 1)
     for i, gain in zip(which, gains, strict=True):
         if not is_lag[i]:
@@ -79,6 +108,4 @@ def _summed(
         else:
             others = np.poly(poles[[other for other in lags if other != i]])
             numerator += gain * (1.0 - poles[i]) / 2.0 * np.convolve([1.0, 1.0], others)
-    return SampledTransferFunction(
-        b=tuple(numerator.tolist()), a=tuple(np.asarray(denominator).tolist()), period_s=period_s
-    )
+    return SampledTransferFunction(b=tuple(numerator.tolist()), a=tuple(denominator.tolist()), period_s=period_s)

@@ -199,7 +199,7 @@ class Search:
         seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
             ranked: Iterable[Start] = self._scan.ranked(rest, fit, self.criterion.cost_of)[:FITTED]
-            if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
+            if unobserved and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
             for start in ranked:
                 if id(start[0]) in seen or start[0].place in apart_from:

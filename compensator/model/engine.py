@@ -522,9 +522,15 @@ class Engine:
                 self._held[name] = value
 
     def _signals(self, dtf: float, tdtf: float) -> Signals[float]:
-        observer = self._observer
+        observer, reference = self._observer, self._reference
         return Signals(
-            drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held
+            drive=observer.drive,
+            ambient_k=observer.ambient_k,
+            t_q_degc=observer.t_q_k + reference.t_q_degc,
+            at_degc=observer.ambient_k + reference.at_degc,
+            y_dtf_um=dtf,
+            y_tdtf_um=tdtf,
+            channels=self._held,
         )
 
     def _effects_rate(self, part: _Part, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:

@@ -255,6 +255,11 @@ class Observer:
         return self._x[self._a]
 
     @property
+    def t_q_k(self) -> float:
+        """T_Q as its sensor shows it by the estimated state, K, as a change from its reference."""
+        return self._t_q_of(self._x)
+
+    @property
     def drive_std(self) -> float:
         """Standard deviation of the drive, in its unit."""
         return math.sqrt(max(float(self._covariance.p[self._q, self._q]), 0.0))

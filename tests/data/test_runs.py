@@ -123,6 +123,17 @@ def test_a_step_a_ramp_and_a_pulse_of_two_samples_stay():
         assert without_outliers(values)[1] == 0
 
 
+def test_two_wild_readings_in_a_row_go_where_a_signal_is_slow():
+    """One disturbance in two samples: −58 K and −20 K in T_Q. Three in a row are something that happens."""
+    c = columns()
+    c["t_q_degc"] = 25.0 + np.random.default_rng(2).normal(0.0, 0.02, N)
+    c["t_q_degc"][200:202] -= [58.0, 20.0]
+    c["t_q_degc"][300:303] -= 20.0
+    (record,), [remark] = cleaned("day.csv", [SampledRecord(t_s=np.arange(N) * 60.0, columns=c)])
+    assert np.flatnonzero(np.isnan(record.columns["t_q_degc"])).tolist() == [200, 201]
+    assert "t_q_degc: 2 outlier(s)" in remark
+
+
 def test_a_signal_full_of_spikes_is_a_signal():
     values = np.random.default_rng(3).normal(0.0, 0.01, 400)
     values[10::15] += 5.0

@@ -67,7 +67,7 @@ def drawn(data, field):
     number = st.floats(0.5, 40.0)
     if field.name in REGRESSION:
         return REGRESSION[field.name](data, number)
-    if field.name == "channel":
+    if field.name in ("channel", "fluid"):
         return "c"
     if field.name == "b":
         return list(FUNCTION.b)
@@ -86,19 +86,21 @@ def test_every_form_streams_what_it_filters(form, data, seed):
     table = {f.name: drawn(data, f) for f in fields}
     effect = effect_from(form.kind, table)
     assert effect.to_table() == table
-    walk = np.random.default_rng(seed).normal(0.0, 3.0, (5, 60)).cumsum(axis=1)
+    walk = np.random.default_rng(seed).normal(0.0, 3.0, (7, 60)).cumsum(axis=1)
     record = RecordSignals(
         period_min=1.0,
         drive=walk[0],
         ambient_k=walk[1],
         y_dtf_um=walk[2],
         y_tdtf_um=walk[3],
-        channels={"c": walk[4]},
+        t_q_degc=walk[4],
+        at_degc=walk[5],
+        channels={"c": walk[6]},
     )
     stream = EffectStream(effect, 1.0)
     stepped = [
-        stream.step(Signals(drive=u, ambient_k=a, y_dtf_um=y, y_tdtf_um=z, channels={"c": c}))
-        for u, a, y, z, c in walk.T.tolist()
+        stream.step(Signals(drive=u, ambient_k=a, t_q_degc=t, at_degc=b, y_dtf_um=y, y_tdtf_um=z, channels={"c": c}))
+        for u, a, y, z, t, b, c in walk.T.tolist()
     ]
     filtered = effect.law(record, filters(effect.blocks(1.0)))
     assert stepped == pytest.approx(filtered, abs=1e-9 * max(1.0, float(np.max(np.abs(filtered)))))
@@ -109,6 +111,7 @@ def test_nothing_acts_before_a_channel_was_seen():
     stream = EffectStream(effect_from("input", table), 1.0)
     before = stream.snapshot()
     for channels in ({}, {"c": math.nan}):
-        signals = Signals(drive=0.0, ambient_k=0.0, y_dtf_um=0.0, y_tdtf_um=0.0, channels=channels)
+        still = {"drive": 0.0, "ambient_k": 0.0, "t_q_degc": 20.0, "at_degc": 20.0, "y_dtf_um": 0.0, "y_tdtf_um": 0.0}
+        signals = Signals(**still, channels=channels)
         assert stream.step(signals) == 0.0
     assert repr(stream.snapshot()) == repr(before)

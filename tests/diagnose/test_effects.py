@@ -11,6 +11,7 @@ from compensator.diagnose.fit import Term, response
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from, kinds
 from compensator.model.effects.hypothesis import proposals
+from compensator.model.effects.input import Input
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -78,7 +79,7 @@ def test_no_temperature_in_degrees_celsius_is_squared(approximate):
     context = dataclasses.replace(evidence_of(QUILL, runs_from(columns)).context, approximate=approximate)
     curves = {}
     for hypothesis in proposals(context):
-        if hypothesis.effect.kind == "input":
+        if isinstance(hypothesis.effect, Input):
             curves.setdefault(hypothesis.effect.channel, set()).add(hypothesis.effect.curve)
     assert curves["coolant_degc"] == {"linear"} and "square" in curves["spindle_rpm"]
     assert "coolant_degc" not in context.zeroed

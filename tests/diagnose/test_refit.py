@@ -14,9 +14,10 @@ from compensator.diagnose.background import Background
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.refitted_paths import with_paths
+from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
+from compensator.model.effects.blocks import FilterBank, lag_or_none
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
@@ -210,16 +211,33 @@ def test_the_other_probes_do_not_become_inputs():
     assert json.dumps(sorted(evidence.context.zeroed)) == '["spindle_rpm"]'
 
 
+TAUS_MIN = (0.0, *np.geomspace(1.0, 200.0, 8).tolist())
+
+
+def with_few_lags(*gains, seed=0):
+    """A regression over heat and ambient temperature whose lags are those that a machine's day needs."""
+    drives = np.random.default_rng(seed).normal(0.0, 1.0, (len(gains), 200)).repeat(10, axis=1)
+    banks = [FilterBank(TAUS_MIN, [(1.0,) * len(TAUS_MIN)], 1.0, lag_or_none).columns(drive) for drive in drives]
+    found = [with_fewer_lags(np.array(g), TAUS_MIN, 1.0, bank) for g, bank in zip(gains, banks, strict=True)]
+    names = (DRIVE["heat"], AMBIENT)[: len(gains)]
+    return Regression(
+        channels=names, exponents=(1.0,) * len(gains), taus_min=TAUS_MIN, gains=tuple(tuple(f.tolist()) for f in found)
+    )
+
+
+def test_a_path_of_few_lags_is_that_of_all_where_the_record_moves_fast():
+    """Large gains of short lags cancel in a step response after a minute, and not where the heat is switched."""
+    gains = (18.0, -25.0, 7.0, -2.0, 1.4, -1.9, 2.4, -2.7, 2.9)
+    drive = np.random.default_rng(1).normal(0.0, 1.0, 300).repeat(10)
+    model, _ = with_paths(load_model("quill"), with_few_lags(gains))
+    wanted = FilterBank(TAUS_MIN, [gains], 1.0, lag_or_none).filter(drive - drive[0])
+    assert np.std(model.dtf.sampled.response(drive - drive[0]) - wanted) < 0.1 * np.std(wanted)
+
+
 def test_paths_fitted_anew_keep_the_observer_sane():
     """With poles that lie close the covariance loses all digits: the stated deviation was 1e15 µm and 0.1 in turn."""
     gains = (0.02, 0.4, -0.3, 0.1, 0.0, 0.2, -0.1, 0.05, 0.1)
-    regression = Regression(
-        channels=(DRIVE["heat"], AMBIENT),
-        exponents=(1.0, 1.0),
-        taus_min=(0.0, *np.geomspace(1.0, 200.0, 8).tolist()),
-        gains=(gains, tuple(10.0 * gain for gain in gains)),
-    )
-    model, rest = with_paths(load_model("quill"), regression)
+    model, rest = with_paths(load_model("quill"), with_few_lags(gains, tuple(10.0 * gain for gain in gains)))
     assert rest is None and model.dtf.sampled.order <= 4
     assert model.dtf.sampled.dc_gain == pytest.approx(sum(gains), rel=0.03)
     engine = Engine(model)

@@ -122,6 +122,8 @@ def test_its_columns_over_a_record_are_what_the_gains_weight() -> None:
     record = RecordSignals(
         drive=drive,
         ambient_k=ambient,
+        t_q_degc=20.0 + drive + ambient,
+        at_degc=20.0 + ambient,
         y_dtf_um=drive,
         y_tdtf_um=ambient,
         channels={"coolant_degc": late, "speed_rpm": CHANNELS["speed_rpm"]},

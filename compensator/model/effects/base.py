@@ -333,7 +333,7 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     candidates = kinds()[kind]
     known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
     keys = TomlTable(f"effect {kind}", table, tuple(known))
-    choices = {choice: form for form in candidates for choice in _choices(form)}
+    choices = {choice: form for form in reversed(candidates) for choice in _choices(form)}
     plain = [form for form in candidates if not _choices(form)]
     named = not plain or (choices and "form" in table)
     form = choices[keys.text("form", tuple(choices))] if named else plain[0]

@@ -89,16 +89,7 @@ class Input(BankEffect, Effect):
 
     def half_time_min(self) -> float:
         """Return the time to half of a step's response at rest, min."""
-        t = np.geomspace(0.1, 10.0 * max(*self.tau_min, 1.0), 400)
-        part: Vector = (1.0 - np.exp(-t[:, None] / np.maximum(self.tau_min, 1e-3))) @ np.array(self.gain)
-        part = part / (math.fsum(self.gain) or 1.0)
-        if not (part >= 0.5).any():
-            return self.delay_min + float(t[-1])
-        there = int(np.argmax(part >= 0.5))
-        if there == 0:
-            return self.delay_min + float(t[0])
-        near = slice(there - 1, there + 1)
-        return self.delay_min + float(np.exp(np.interp(0.5, part[near], np.log(t[near]))))
+        return half_time_min(self.tau_min, self.gain, self.delay_min)
 
 
 @register
@@ -148,6 +139,20 @@ def banks(context: Context) -> list[Hypothesis]:
         for channel in context.channels
         for curve in (("linear", "power 5/3", "square") if channel in context.zeroed else ("linear",))
     ]
+
+
+def half_time_min(taus_min: Sequence[float], gains: Sequence[float], delay_min: float = 0.0) -> float:
+    """Return the time to half of a step's response at rest of lags with gains, behind a delay, min."""
+    t = np.geomspace(0.1, 10.0 * max(*taus_min, 1.0), 400)
+    part: Vector = (1.0 - np.exp(-t[:, None] / np.maximum(taus_min, 1e-3))) @ np.array(gains)
+    part = part / (math.fsum(gains) or 1.0)
+    if not (part >= 0.5).any():
+        return delay_min + float(t[-1])
+    there = int(np.argmax(part >= 0.5))
+    if there == 0:
+        return delay_min + float(t[0])
+    near = slice(there - 1, there + 1)
+    return delay_min + float(np.exp(np.interp(0.5, part[near], np.log(t[near]))))
 
 
 def unit_of(channel: str) -> str:

@@ -23,6 +23,8 @@ class Signals(Generic[S]):
         Estimated heat, W (T_Q − AT, K, in a direct model).
     ambient_k : float
         AT as a change from the reference, K.
+    t_q_degc, at_degc : float
+        T_Q and AT as they are, °C, for what exchanges heat with something whose temperature is measured, too.
     y_dtf_um, y_tdtf_um : float
         Share of each path, µm.
     channels : mapping of str to float
@@ -31,6 +33,8 @@ class Signals(Generic[S]):
 
     drive: S
     ambient_k: S
+    t_q_degc: S
+    at_degc: S
     y_dtf_um: S
     y_tdtf_um: S
     channels: Mapping[str, S] = field(default_factory=dict)
@@ -132,7 +136,15 @@ class RecordSignals(Signals[Vector]):
         still = np.zeros(self.size)
         channels = {name: np.full(self.size, values[0]) for name, values in self.channels.items()}
         return dataclasses.replace(
-            self, drive=still, ambient_k=still, y_dtf_um=still, y_tdtf_um=still, channels=channels, initial_um=None
+            self,
+            drive=still,
+            ambient_k=still,
+            t_q_degc=np.full(self.size, self.t_q_degc[0]),
+            at_degc=np.full(self.size, self.at_degc[0]),
+            y_dtf_um=still,
+            y_tdtf_um=still,
+            channels=channels,
+            initial_um=None,
         )
 
     @property

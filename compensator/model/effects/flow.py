@@ -1,0 +1,103 @@
+"""`input`, form `flow`: a fluid that flows now and then heats or cools what it wets.
+
+y += Σ_i L(τ_i) · [gain_i · s · (F − T_Q) + gain_air_i · s · (F − AT)], less that at the start
+
+with F the temperature of the fluid and s how much of it acts: with φ the flow as a share of its span,
+s = φ (1 + h) / (φ + h). What is wetted lies between T_Q and AT in temperature, so both differences act. The more flows,
+the better a film conducts, until what is behind it limits the heat: at φ = h half of what a large flow would carry.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
+from compensator.model.effects.blocks import Block, FilterBank, FromStart, S
+from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
+from compensator.model.effects.seen import Seen, digits, quantity
+from compensator.model.effects.signals import Signals
+
+
+@register
+class Flow(BankEffect, Effect):
+    """A fluid whose flow and temperature are measured."""
+
+    kind = "input"
+    linear = ("gain", "gain_air")
+    form: str = only(default="flow")
+    channel: str = text()
+    fluid: str = text()
+    span: float = number(1e-12)
+    half: float = number(1e-6, 1e6)
+    tau_min: tuple[float, ...] = numbers(0.0, 1e5)
+    gain: tuple[float, ...] = numbers()
+    gain_air: tuple[float, ...] = numbers()
+
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
+        return FromStart(), FromStart(), FilterBank(self.tau_min, (self.gain, self.gain_air), period_min)
+
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
+        flow = signals.channels[self.channel] / self.span
+        flow = 0.5 * (flow + abs(flow))  # noise about 0 is no flow
+        acting = flow * (1.0 + self.half) / (flow + self.half)
+        fluid = signals.channels[self.fluid]
+        return run[0](acting * (fluid - signals.t_q_degc)), run[1](acting * (fluid - signals.at_degc))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return self.channel, self.fluid
+
+    def named(self, given: dict[str, float]) -> dict[str, float]:
+        """Return the gain at rest by the fluid's temperature at the largest flow, and when half of it is there."""
+        half = {name: value for name, value in given.items() if name == "half"}
+        return {"gain_um_per_k": math.fsum(self._gains), "half_time_min": self.half_time_min(), **half}
+
+    @property
+    def _gains(self) -> tuple[float, ...]:
+        """Gain behind each lag by the fluid's temperature."""
+        return tuple(a + b for a, b in zip(self.gain, self.gain_air, strict=True))
+
+    def half_time_min(self) -> float:
+        """Return the time to half of a step's response at rest, min."""
+        return half_time_min(self.tau_min, self._gains)
+
+    def explain(self, seen: Seen) -> str:
+        assert seen.channel is not None
+        gain, most = digits(math.fsum(self._gains)), quantity(seen.channel.ends(self.channel)[1], self.channel)
+        return (
+            f"{seen.words}: while {self.channel} flows, {self.fluid} acts on the machine by its differences to T_Q and "
+            f"to the air: {gain} µm/K at {most}, half of it after {digits(self.half_time_min())} min. The base model "
+            f"lacks this fluid, which heats or cools what it wets{NEEDS_CHANNEL}."
+        )
+
+
+@register
+class FlowBank(Flow):
+    """The same through a filter bank of given lags: for a response whose form is not known."""
+
+    has_any_form = True
+
+
+@proposes
+def flows(context: Context) -> Iterator[Hypothesis]:
+    """Propose every temperature as that of a fluid whose flow is a channel with a zero of its own."""
+    half = Free(name="half", low=0.01, high=100.0, grid=(0.03, 0.3, 3.0))
+    one, several = context.tau(), context.bank_min
+    for channel in sorted(context.zeroed):
+        for fluid in context.channels:
+            if not fluid.endswith(DEGC):
+                continue
+            place: dict[str, Any] = {"channel": channel, "fluid": fluid, "span": context.spans[channel], "half": 1.0}
+            form = f"flow of {fluid}"
+            if context.approximate:
+                ones = (1.0,) * len(several)
+                bank = FlowBank(**place, tau_min=several, gain=ones, gain_air=ones)
+                names = (*numbered("gain", len(several)), *numbered("gain_air", len(several)))
+                yield Hypothesis(effect=bank, form=f"row, {form}", free=(half,), amplitudes=names)
+            else:
+                lag = Flow(**place, tau_min=(0.0,), gain=(1.0,), gain_air=(1.0,))
+                gains = ("gain_um_per_k", "gain_air_um_per_k")
+                yield Hypothesis(effect=lag, form=form, free=(half, one), amplitudes=gains)

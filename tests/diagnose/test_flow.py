@@ -1,0 +1,48 @@
+"""A fluid that flows now and then is found by its flow and its temperature, and predicts another day."""
+
+import numpy as np
+import pytest
+
+from compensator.diagnose.diagnosis import diagnose
+from compensator.identify.calibration import predict
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import Scenario, lag, record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+#: Lag of what is wetted, min; where it lies between AT and T_Q; its gain at full flow, µm/K.
+TAU_MIN, BETWEEN, GAIN = 25.0, 0.7, 0.6
+
+
+def wetted(signals):
+    """Coolant over the nose while a pump runs, whose speed is logged: a good film, so that a fifth of it is half."""
+    flow = signals[1]["fan_rpm"] / 3000.0
+    at, difference = signals[1]["ambient_degc"], signals[6]
+    heat = flow / (flow + 0.2) * (signals[1]["coolant_degc"] - at - BETWEEN * difference)
+    return GAIN * lag(heat - heat[0], TAU_MIN)
+
+
+@pytest.fixture(scope="module")
+def found():
+    columns, _, _ = record([Scenario(place=("input", "", "fan_rpm"), act=wetted)], 1400)
+    return diagnose(QUILL, runs_from(columns))
+
+
+def test_it_is_named_by_its_flow_and_its_fluid(found):
+    [effect] = found.effects
+    assert effect.place == ("input", "", "fan_rpm") and effect.effect.fluid == "coolant_degc"
+    assert found.verdict == "explained"
+    assert effect.effect.channels == ("fan_rpm", "coolant_degc")
+    for words in ("while fan_rpm flows, coolant_degc acts", "differences to T_Q and to the air"):
+        assert words in effect.explanation
+    (tau_min,) = effect.effect.tau_min
+    gain, gain_air = effect.effect.gain[0], effect.effect.gain_air[0]
+    assert tau_min == pytest.approx(TAU_MIN, rel=0.1)
+    assert gain / (gain + gain_air) == pytest.approx(BETWEEN, abs=0.1)
+
+
+def test_the_extended_model_predicts_a_day_with_other_flows(found):
+    columns, true, _ = record([Scenario(place=("input", "", "fan_rpm"), act=wetted)], 1401)
+    (run,) = runs_from(columns)
+    errors = [np.std(true - predict(model, run)) for model in (QUILL, found.model)]
+    assert errors[0] > 2.0 and errors[1] < 0.15 * errors[0]
