@@ -392,7 +392,13 @@ def _diagnosed(
     for one in validation:  # refused before the search, which may take minutes
         remarks += screened([one])[1]
     found = find_effects(
-        base, runs, expected=expected, keep_paths=keep_paths, progress=progress, executor_map=executor_map
+        base,
+        runs,
+        expected=expected,
+        keep_paths=keep_paths,
+        unseen=_is_unseen(base, measured),
+        progress=progress,
+        executor_map=executor_map,
     )
     remarks += found.evidence.no_causes.values()
     extended = as_in_file(found.model, _provenance(base, measured, found))
@@ -409,6 +415,13 @@ def _diagnosed(
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
     shown = tuple(one for one in free_run if one.samples)
     return DiagnosisResult(model=extended, diagnosis=found, remarks=tuple(remarks), free_run=shown, words=words)
+
+
+def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
+    """Return whether a model was calibrated, and on none of these data."""
+    named = base.provenance.get("data")
+    known = [one.get("sha256") for one in named if isinstance(one, dict)] if isinstance(named, list) else []
+    return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 
 def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diagnosis) -> dict[str, Any]:

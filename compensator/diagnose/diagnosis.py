@@ -58,6 +58,7 @@ def diagnose(
     *,
     expected: frozenset[Place] = frozenset(),
     keep_paths: bool = False,
+    unseen: bool = False,
     progress: Progress = unreported,
     executor_map: ExecutorMap = map,
 ) -> Diagnosis:
@@ -73,6 +74,9 @@ def diagnose(
         Effects that another axis of the machine shows.
     keep_paths : bool
         Keep the paths of the base as they are even if its own calibration left much.
+    unseen : bool
+        Whether the base was calibrated on other data: its error on these is then to be surpassed by paths that are
+        fitted anew, or they are kept.
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -98,6 +102,8 @@ def diagnose(
     held_out = held_out_of(found, places, progress, executor_map)
     found, effects, held_out = _worth_deploying(found, effects, held_out)
     found, effects, held_out = _by_channels(found, effects, held_out)
+    if evidence.free_paths and unseen and _foretells_better(found, held_out):
+        return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
     few = evidence.is_sparse
     reverses = any(effect.reverses_path for effect in effects)
     worse_um = _worse_in_free_run(found)
@@ -221,6 +227,14 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     base_um, own_um = in_free_run(found)
     is_worse = not found.search.evidence.is_sparse and own_um > CONTRADICTS * base_um
     return (base_um, own_um) if is_worse else None
+
+
+def _foretells_better(found: Findings, held_out: HeldOut) -> bool:
+    """Return whether the base as it is foretells data that it has not seen better than paths that are fitted anew.
+
+    Both errors are of data that took no part: those of held-out blocks, and the base's own in free run.
+    """
+    return in_free_run(found)[0] < rms_of(held_out.whole)
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:

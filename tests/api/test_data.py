@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import matplotlib
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from scipy.io import savemat
 
 import compensator as tc
+from compensator.api.diagnosis import _is_unseen
 from compensator.data.measurement import measurements
 from tests.api.tables import START, arrays, by_time, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W
@@ -255,3 +257,14 @@ def test_the_plot_of_a_frame_is_that_of_the_result_and_with_arguments_that_of_pa
         assert isinstance(axes, Axes) and len(axes.lines) == 1
         pyplot.close(axes.figure)
     assert type(out.head().plot).__module__.startswith("pandas"), "a slice is a plain DataFrame"
+
+
+@pytest.mark.parametrize(
+    ("known", "unseen"), [("first", (False, True)), ("nothing", (False, False)), ("a text", (False, False))]
+)
+def test_whether_a_model_has_seen_the_data_is_known_by_their_hash(known: str, unseen: tuple[bool, bool]) -> None:
+    both = [SMALL, SMALL | {"t_q_degc": [20.0, 21.0, 23.0]}]
+    first, second = (measurements(one, "data", None, needed=True) for one in both)
+    data = {"first": [{"sha256": first[0].origins[0].sha256}, 1], "nothing": [], "a text": "first"}[known]
+    model = dataclasses.replace(tc.load_model("quill"), provenance={"data": data})
+    assert (_is_unseen(model, first), _is_unseen(model, second)) == unseen

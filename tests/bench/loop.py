@@ -255,11 +255,12 @@ def _spell(week, number, diagnoses, steps, errors, base_sha, bound):
     spell = week.spells[number]
     begin, until = spell.from_min, spell.from_min + WITHIN_MIN
     right = {":".join(filter(None, place)) for place in spell.places}
-    direct = {name.replace("TTF", "DTF") for name in right}
+    right |= {name.replace("TTF", "DTF") for name in right}
+    # An effect of two channels, such as a flow and its temperature, is named by the first.
     named = [
         key[0]
         for key, one in diagnoses.found.items()
-        if begin <= key[0] <= until and set(one.effects) & (right | direct)
+        if begin <= key[0] <= until and any(effect.partition("+")[0] in right for effect in one.effects)
     ]
     changed = [
         steps[i].outcome.sample.seq

@@ -140,6 +140,30 @@ def test_paths_that_held_out_blocks_contradict_are_not_deployed(
     assert (again.dtf == model.dtf and again.effects == ()) is not deployed
 
 
+def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, found, searches, monkeypatch):
+    """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
+    real, asked = diagnosis_module.findings_of, []
+
+    def findings_of(evidence):
+        asked.append(evidence.free_paths)
+        return searches["findings_of"][0] if evidence.free_paths else real(evidence)
+
+    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
+    held_out_of = diagnosis_module.held_out_of
+    monkeypatch.setattr(
+        diagnosis_module,
+        "held_out_of",
+        lambda found, *more: searches["held_out_of"][0] if asked == [True] else held_out_of(found, *more),
+    )
+    shown_um = found.after.rms_um
+    for base_um, kept in ((0.9 * shown_um, True), (1.1 * shown_um, False)):
+        monkeypatch.setattr(diagnosis_module, "in_free_run", lambda _, base_um=base_um: (base_um, base_um))
+        asked.clear()
+        again = diagnose(model, runs, unseen=True)
+        assert (again.model.dtf == model.dtf) is kept
+        assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is kept
+
+
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(model, found, runs):
     silent = dataclasses.replace(model, provenance={})
     again = diagnose(silent, runs)
