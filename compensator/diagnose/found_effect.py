@@ -81,6 +81,11 @@ class FoundEffect:
         return self.place[2] or None
 
     @property
+    def channels(self) -> tuple[str, ...]:
+        """Every channel that it acts by, that of its place first."""
+        return tuple(dict.fromkeys((self.channel, *self.effect.channels))) if self.channel else ()
+
+    @property
     def form(self) -> str:
         """Which variant of its kind."""
         return self.term.hypothesis.form

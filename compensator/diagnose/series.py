@@ -34,7 +34,7 @@ def series_of(diagnosis: Diagnosis) -> dict[str, Vector]:
         columns[f"effect_{i}_um"] = effect.signal
     beside = {"remainder_um": diagnosis.remainder_um, "paths_um": diagnosis.paths_um}
     columns |= {name: values for name, values in beside.items() if values.any()}
-    for name in dict.fromkeys(effect.channel for effect in diagnosis.effects if effect.channel):
+    for name in dict.fromkeys(channel for effect in diagnosis.effects for channel in effect.channels):
         if all(name in run.channels for run in evidence.runs):
             columns[name] = np.concatenate([run.channels[name] for run in evidence.runs])
     return columns

@@ -418,4 +418,6 @@ def in_words(key: str) -> str:
     while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):
         at -= 1
     unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
+    if len(words) == at + 1:  # a unit by itself is no divisor
+        unit = unit.strip("()")
     return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"

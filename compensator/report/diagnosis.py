@@ -110,7 +110,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     rest, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
     deployed = rest is not None and rest.deployed
     stands = deployed and rest is not None and rest.instead
-    causes = {cause[0]: cause for effect in diagnosis.effects if (cause := _cause(diagnosis, effect)) is not None}
+    causes = {cause[0]: cause for effect in diagnosis.effects for cause in _causes(diagnosis, effect)}
     below = tuple(
         Figure(
             title="",
@@ -189,14 +189,13 @@ def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Sectio
 
 def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Figure:
     """Show the residual without the effect, the effect over it, and below it what it acts by."""
-    cause = _cause(diagnosis, effect)
-    below: tuple[Figure, ...] = ()
-    if cause is not None:
-        label, unit, values = cause
-        panel = Figure(
+    causes = _causes(diagnosis, effect)
+    below = tuple(
+        Figure(
             title="", x_label="time, h", y_label=unit, lines=(time.line(label, values),), edges=time.unnamed, height=1.9
         )
-        below = (panel,)
+        for label, unit, values in causes
+    )
     rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
     note = f"Residual in all data without every other effect.{rest}"
     return Figure(
@@ -215,21 +214,22 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
         ),
         edges=time.edges,
         below=below,
-        note=f"{note} {'' if cause else 'No channel shows its cause.'}{time.note}".strip(),
+        note=f"{note} {'' if causes else 'No channel shows its cause.'}{time.note}".strip(),
     )
 
 
-def _cause(diagnosis: Diagnosis, effect: FoundEffect) -> tuple[str, str, Vector] | None:
-    """Return what an effect acts by, its unit and its course: its channel, or what drives its path."""
+def _causes(diagnosis: Diagnosis, effect: FoundEffect) -> list[tuple[str, str, Vector]]:
+    """Return what an effect acts by, its unit and its course: its channels, or what drives its path."""
     records = diagnosis.evidence.signals
-    if (channel := effect.channel) is not None:
-        return channel, unit_of_channel(channel), np.concatenate([record.channels[channel] for record in records])
+    if channels := effect.channels:
+        columns = [np.concatenate([record.channels[name] for record in records]) for name in channels]
+        return [(name, unit_of_channel(name), values) for name, values in zip(channels, columns, strict=True)]
     if (path := effect.path) is None:
-        return None
+        return []
     source = np.concatenate([record.source(path) for record in records])
     if path == "TDTF":
-        return "AT, change from the start", "K", source
-    return ("heat, estimated", "W", source) if diagnosis.model.ttf else ("T_Q − AT", "K", source)
+        return [("AT, change from the start", "K", source)]
+    return [("heat, estimated", "W", source) if diagnosis.model.ttf else ("T_Q − AT", "K", source)]
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:

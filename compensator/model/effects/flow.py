@@ -16,7 +16,7 @@ from typing import Any
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
+from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min, unit_of
 from compensator.model.effects.seen import Seen, digits, quantity
 from compensator.model.effects.signals import Signals
 
@@ -51,9 +51,9 @@ class Flow(BankEffect, Effect):
         return self.channel, self.fluid
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
-        """Return the gain at rest by the fluid's temperature at the largest flow, and when half of it is there."""
-        half = {name: value for name, value in given.items() if name == "half"}
-        return {"gain_um_per_k": math.fsum(self._gains), "half_time_min": self.half_time_min(), **half}
+        """Return the gain at rest by the fluid's temperature at the largest flow, the time to half of it, and h."""
+        found = {"gain_um_per_k": math.fsum(self._gains), "half_time_min": self.half_time_min()}
+        return found | {f"half_flow_{unit_of(self.channel)}": self.half * self.span}
 
     @property
     def _gains(self) -> tuple[float, ...]:
