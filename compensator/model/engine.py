@@ -124,6 +124,8 @@ class EngineState:
         The last complete sample, where a gap that begins after it may be bridged.
     gap : Gap, optional
         The gap under way.
+    shifted_k : tuple of (float, float)
+        By how much T_Q and AT show more than they did at the zero, because their sensors have others, K.
     """
 
     observer: ObserverState
@@ -132,6 +134,7 @@ class EngineState:
     reference: Reference
     last_complete: Inputs | None = None
     gap: Gap | None = None
+    shifted_k: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +218,7 @@ class Engine:
         self._outputs = [[(numbers[name], weight) for name, weight in output.weights] for output in model.outputs]
         absolute = model.inputs == "absolute"
         self._reference = Reference(0.0, 0.0) if absolute else Reference(NAN, NAN)
+        self._shifted_k = (0.0, 0.0)
         self._held: dict[str, float] = {}
         self._last_complete: Inputs | None = None
         self._gap: Gap | None = None
@@ -254,6 +258,7 @@ class Engine:
             raise ModelError("a zero needs both temperatures; one is missing")
         if self.model.inputs == "changes":
             self._reference = Reference(t_q_degc, at_degc)
+        self._shifted_k = (0.0, 0.0)
         self._observer.reset()
         self._start_effects()
         self._held = {}
@@ -275,6 +280,7 @@ class Engine:
             reference=self._reference,
             last_complete=self._last_complete,
             gap=self._gap,
+            shifted_k=self._shifted_k,
         )
 
     def restore(self, state: EngineState) -> None:
@@ -294,7 +300,7 @@ class Engine:
         for effect, effect_state in zip(self._effects, state.effects, strict=True):
             effect.restore(effect_state)
         self._held = dict(state.channels)
-        self._reference = state.reference
+        self._reference, self._shifted_k = state.reference, state.shifted_k
         self._last_complete, self._gap = state.last_complete, state.gap
 
     def check(self, state: EngineState) -> None:
@@ -381,8 +387,9 @@ class Engine:
 
     def shift_reference(self, t_q_k: float, at_k: float) -> None:
         """Move the reference without a change of the state: a sensor has another zero from now on, K."""
-        reference = self._reference
+        reference, (t_q_before, at_before) = self._reference, self._shifted_k
         self._reference = Reference(reference.t_q_degc + t_q_k, reference.at_degc + at_k)
+        self._shifted_k = (t_q_before + t_q_k, at_before + at_k)
 
     def run(
         self,
@@ -522,12 +529,12 @@ class Engine:
                 self._held[name] = value
 
     def _signals(self, dtf: float, tdtf: float) -> Signals[float]:
-        observer, reference = self._observer, self._reference
+        observer, reference, (t_q_more, at_more) = self._observer, self._reference, self._shifted_k
         return Signals(
             drive=observer.drive,
             ambient_k=observer.ambient_k,
-            t_q_degc=observer.t_q_k + reference.t_q_degc,
-            at_degc=observer.ambient_k + reference.at_degc,
+            t_q_degc=observer.t_q_k + reference.t_q_degc - t_q_more,
+            at_degc=observer.ambient_k + reference.at_degc - at_more,
             y_dtf_um=dtf,
             y_tdtf_um=tdtf,
             channels=self._held,
@@ -552,9 +559,9 @@ class Engine:
 
     def _repeat(self, gap: Gap, after: Inputs) -> None:
         """Return to the last complete sample and repeat the gap with interpolated inputs."""
-        reference = self._reference
+        reference, shifted_k = self._reference, self._shifted_k
         self.restore(gap.state)
-        self._reference = reference
+        self._reference, self._shifted_k = reference, shifted_k
         n = len(gap.samples) + 1
         estimator = self.model.estimator
         feed = self.model.ttf.sampled.b[0] if self.model.ttf else 1.0

@@ -149,7 +149,17 @@ def frozen_state(state: CompensationState) -> Callable[[], bytes]:
     for kept in (table["memory"], *filter(None, branches)):
         if kept["estimate"] is not None and not kept["estimate"]["outputs"]:
             del kept["estimate"]["outputs"]
+    for engine in (table["engine"], *(branch["engine"] for branch in branches if branch)):
+        _leave_out_no_shift(engine)
     return lambda: json.dumps(_encodable(table), separators=(",", ":")).encode()
+
+
+def _leave_out_no_shift(engine: dict[str, Any]) -> None:
+    """Leave out that no sensor has another zero, as versions did that did not keep it."""
+    if not any(engine["shifted_k"]):
+        del engine["shifted_k"]
+    if engine["gap"] is not None:
+        _leave_out_no_shift(engine["gap"]["state"])
 
 
 def _encodable(value: Any) -> Any:
@@ -185,8 +195,9 @@ def decode_state(data: bytes) -> CompensationState:
     if state.jumps is not None:
         engines += [branch.engine for branch in (state.jumps.believing, state.jumps.shifted) if branch is not None]
     nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
-    numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
+    numbers = [state.offset_um]
+    numbers += [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]
     numbers += [value for one in (state.axes or {}).values() for value in (one.offset, one.base)]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
-        raise DataError("state: a number of the offset or of the observer is not finite, or too large to be valid")
+        raise DataError("state: a number of the offset or of the engine is not finite, or too large to be valid")
     return state

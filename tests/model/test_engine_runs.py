@@ -249,6 +249,28 @@ def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
     assert y_of(whole.run(t_q, at, {"coolant_degc": coolant}))[50:] == pytest.approx(y_of(run)[50:], abs=1e-12)
 
 
+@pytest.mark.parametrize("method", ["inverse", "kalman"])
+def test_a_sensor_with_another_zero_does_not_move_what_acts_by_its_temperature(method: str) -> None:
+    """A couple that was exchanged reads 3 K more: what coolant takes from the machine is as it was, over restarts."""
+    table = {"form": "flow", "channel": "flow_lpm", "fluid": "coolant_degc", "span": 10.0, "half": 0.5}
+    effect = effect_from("input", table | {"tau_min": [20.0], "gain": [0.5], "gain_air": [0.2]})
+    model = dataclasses.replace(with_method(method), effects=(effect,))
+    t_q, at = temperatures()
+    channels = [{"flow_lpm": 10.0 * (i % 90 > 30), "coolant_degc": 15.0} for i in range(N)]
+    whole = started(model, t_q, at)
+    expected = [whole.step(*values) for values in zip(t_q, at, channels, strict=True)]
+    engine, found = started(model, t_q, at), []
+    for i in range(N):
+        if i == 300:
+            engine.shift_reference(3.0, -1.0)
+            engine, before = Engine(model), engine
+            engine.restore(before.snapshot())
+        more_k = (3.0, -1.0) if i >= 300 else (0.0, 0.0)
+        found.append(engine.step(t_q[i] + more_k[0], at[i] + more_k[1], channels[i]))
+    assert np.ptp([one.y_effects_um[0] for one in expected]) > 2.0
+    assert y_of(found) == pytest.approx(y_of(expected), abs=1e-9)
+
+
 def test_unknown_effect_is_named() -> None:
     with pytest.raises(ModelError, match=r"effect 1 has kind 'magic', expected one of: .*gain"):
         parse_model(f'{TEXT}\n[[effect]]\nkind = "magic"\n'.encode(), source="written")
