@@ -278,32 +278,31 @@ def _through(poles: Vector, u: Matrix) -> Matrix:
     return np.asarray(out, dtype=np.float64)
 
 
-def _difference(u: Matrix) -> Matrix:
-    return np.diff(u, axis=-1, prepend=0.0)
+def _differences(signal: Vector, count: int, table: Matrix) -> None:
+    """Write a signal and its differences of the orders below `count` into the columns of a table."""
+    for k in range(count):
+        if k:
+            # As `np.diff` with a 0 before it, in a fraction of its time: a search takes thousands of them.
+            before, signal = signal, signal.copy()
+            signal[1:] -= before[:-1]
+        table[:, k] = signal
 
 
 def _input_columns(u: Matrix, poles: Vector, structure: Structure) -> Matrix:
-    columns = []
+    table, first = np.empty((u.shape[-1], structure.amplitudes)), 0
     for signal, terms in zip(_through(poles, u), structure.terms, strict=True):
-        difference = signal
-        for _ in range(terms):
-            columns.append(difference)
-            difference = _difference(difference)
-    return np.stack(columns, axis=1)
+        _differences(signal, terms, table[:, first : first + terms])
+        first += terms
+    return table
 
 
 def _nuisance_columns(segment: Segment, poles: Vector, structure: Structure) -> Matrix:
-    n, columns = segment.y.size, []
-    if not segment.rest and poles.size:
+    n, states = segment.y.size, 0 if segment.rest else poles.size
+    table = np.ones((n, states + structure.offset))
+    if states:
         impulse = np.zeros(n)
         impulse[0] = 1.0
-        free = _through(poles, impulse)
-        for _ in range(poles.size):
-            columns.append(free)
-            free = _difference(free)
-    if structure.offset:
-        columns.append(np.ones(n))
-    table: Matrix = np.stack(columns, axis=1) if columns else np.zeros((n, 0))
+        _differences(_through(poles, impulse), states, table)
     return table
 
 
@@ -331,6 +330,8 @@ class _Problem:
     def __init__(self, segments: Sequence[Segment], structure: Structure, period_s: float) -> None:
         self.segments, self.structure, self.period_s = segments, structure, period_s
         self.rows = [int(segment.used.sum()) for segment in segments]
+        #: Rows of each segment that are used; where all are, nothing is picked out of them.
+        self.used = [slice(None) if segment.used.all() else np.flatnonzero(segment.used) for segment in segments]
         self.states = [0 if segment.rest else structure.order for segment in segments]
         prior = np.zeros(sum(self.states) + (structure.amplitudes if structure.prior else 0))
         self.y = np.concatenate([*(segment.y[segment.used] for segment in segments), prior])
@@ -354,10 +355,10 @@ class _Problem:
         own = [nuisance.shape[1] for _, nuisance in parts]
         table = np.zeros((self.y.size, width + sum(own)))
         row, column, prior = 0, width, sum(self.rows)
-        each = zip(self.segments, parts, self.rows, self.states, strict=True)
-        for segment, (inputs, nuisance), count, states in each:
-            table[row : row + count, :width] = inputs[segment.used]
-            table[row : row + count, column : column + nuisance.shape[1]] = nuisance[segment.used]
+        each = zip(self.used, parts, self.rows, self.states, strict=True)
+        for used, (inputs, nuisance), count, states in each:
+            table[row : row + count, :width] = inputs[used]
+            table[row : row + count, column : column + nuisance.shape[1]] = nuisance[used]
             for k in range(states):
                 table[prior, column + k] = STATE_PRIOR * np.max(np.abs(nuisance[:, k]))
                 prior += 1
@@ -401,8 +402,8 @@ class _Problem:
     def sensitivities(self) -> Matrix:
         """Return ∂ŷ / ∂ log τ at fixed amplitudes on the samples used."""
         slopes = pole_slopes(self.poles, self.taus, self.period_s)
-        parts = zip(self.outputs(), self.segments, strict=True)
-        tables: list[Matrix] = [_sensitivities(out, self.poles, slopes)[segment.used] for out, segment in parts]
+        parts = zip(self.outputs(), self.used, strict=True)
+        tables: list[Matrix] = [_sensitivities(out, self.poles, slopes)[used] for out, used in parts]
         prior = np.zeros((self.y.size - self.count, self.poles.size))
         stacked: Matrix = np.concatenate([*tables, prior])
         return stacked

@@ -94,12 +94,16 @@ class TcpPort:
         if self._placeholder is not None:
             self._placeholder.close()
             self._placeholder = None
-        if self._server is not None:
-            self._server.close()
-            self._server = None
-        # A connection accepted just now reaches `connection_made` a few turns of the loop later.
-        for _ in range(4):
-            await asyncio.sleep(0)
+        server, self._server = self._server, None
+        if server is not None:
+            # First only stop accepting: a server that is closed while a connection is on its way from `accept` to
+            # `connection_made`, a few turns of the loop, forgets the connection and leaves it open.
+            loop = asyncio.get_running_loop()
+            for listener in server.sockets:
+                loop.remove_reader(listener.fileno())
+            for _ in range(4):
+                await asyncio.sleep(0)
+            server.close()
         for connection in tuple(self.connections):
             if connection.transport is not None:
                 connection.transport.abort()

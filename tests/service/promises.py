@@ -35,7 +35,8 @@ class Promises:
         return reply
 
     def _is_open(self) -> bool:
-        self.open = [promise for promise in self.open if not promise.done()]
+        # The same list stays: a test may clear it.
+        self.open[:] = [promise for promise in self.open if not promise.done()]
         return bool(self.open)
 
     async def wait(self, part: float = 1.0) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import threading
@@ -167,18 +168,18 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = Machine(tmp_path / "a")
-    held = threading.Event()
+    held, loop = threading.Event(), asyncio.get_running_loop()
     prepare = Adoption._candidate
 
     def slow(self: Adoption, *arguments: Any) -> Any:
         warmed = prepare(self, *arguments)
+        loop.call_soon_threadsafe(machine.promises.open.clear)  # simulated time does not wait for what is held
         assert held.wait(120.0)
         return warmed
 
     monkeypatch.setattr(Adoption, "_candidate", slow)
     asked = machine.at_sample[150] = Asked(machine, "adopt", payload(STRONGER))
     second = machine.at_sample[160] = Asked(machine, "back")
-    machine.at_sample[165] = machine.promises.open.clear  # simulated time does not wait for what is held
 
     def release() -> None:
         held.set()

@@ -12,15 +12,25 @@ from compensator.data.table import Table
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import usable_table
 from compensator.service.loop.run import LoopRun
+from compensator.service.outcome import Outcome
 from tests.service.looping import Night, machine, run, settings, shown
 from tests.service.test_restart import QUILL
 
+#: Both tests of an effect that began within the record ask about the same one: it is searched once.
+once = pytest.mark.usefixtures("equal_questions_once")
+SAMPLES, BEGINS = 2160, 720
 
-def test_an_effect_that_began_within_the_record_is_found_in_the_end_of_it() -> None:
+
+@pytest.fixture(scope="module")
+def begun() -> list[Outcome]:
+    """What a service has on record of a machine on which an effect begins."""
     loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
-    begins = 720
-    steps = run(loop, machine(2160, acts=lambda i: float(i > begins)))
-    found = diagnosis_of_record([step.outcome for step in steps], QUILL)
+    return [step.outcome for step in run(loop, machine(SAMPLES, acts=lambda i: float(i > BEGINS)))]
+
+
+@once
+def test_an_effect_that_began_within_the_record_is_found_in_the_end_of_it(begun: list[Outcome]) -> None:
+    found = diagnosis_of_record(begun, QUILL)
     assert found.model is not None and "coolant_degc" in " ".join(found.effects)
 
 
@@ -31,12 +41,11 @@ def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate() 
     assert found.model is None and found.effects == () and "step" in found.needs
 
 
+@once
 def test_what_is_after_the_change_of_the_residual_is_diagnosed_again_and_ends_of_it_until_they_are_too_short(
-    monkeypatch: pytest.MonkeyPatch,
+    begun: list[Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
-    begins, spans = 1200, list[float]()
-    table = usable_table([step.outcome for step in run(loop, machine(2160, acts=lambda i: float(i > begins)))])
+    spans = list[float]()
 
     def counted(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:
         spans.append(float(np.ptp(table.t_s)) / 60.0)
@@ -44,6 +53,6 @@ def test_what_is_after_the_change_of_the_residual_is_diagnosed_again_and_ends_of
 
     monkeypatch.setattr(api, "_diagnosed", counted)
     monkeypatch.setattr(api, "WELL_EXPLAINED", 0.0)
-    diagnoses_of_table(table, QUILL)
-    assert spans[1] == pytest.approx(2160 - begins, abs=120)
+    diagnoses_of_table(usable_table(begun), QUILL)
+    assert spans[1] == pytest.approx(SAMPLES - BEGINS, abs=120)
     assert spans == sorted(spans, reverse=True) and spans[-1] == 60.0 * api.SHORTEST_H

@@ -276,12 +276,25 @@ async def test_silent_stream_is_connected_anew(
         await controller.connected.wait()
 
 
+async def older_s(made: Any, seconds: float) -> None:
+    """Wait until a block has come, and let it be that old."""
+    link = made._link
+    async with asyncio.timeout(BOUND_S):
+        while not link._complete():
+            await asyncio.sleep(0.001)
+    for kept in link._kept.values():
+        kept[-1] = dataclasses.replace(kept[-1], time_s=kept[-1].time_s - seconds)
+
+
 async def test_old_measurements_are_left_out(rig: Any, controller: Controller) -> None:
-    made = await started(rig, controller, window_s=0.5)
+    made = await started(rig, controller, window_s=5.0)
     controller.send(block(1, (10, 10)))
-    await asyncio.sleep(0.8)
+    await older_s(made, 6.0)
     controller.send(block(2, (30, 30)))
-    await asyncio.sleep(0.005)
+    async with asyncio.timeout(BOUND_S):
+        while made._link._next_counter != 3:
+            await asyncio.sleep(0.001)
+    assert [len(kept) for kept in made._link._kept.values()] == [2, 2]
     assert (await made.read())[0].count == 1
 
 
@@ -292,12 +305,7 @@ async def test_a_stream_that_has_stopped_has_no_value(
     monkeypatch.setattr(capancdt_link, "SILENT_S", 60.0)
     made = await started(rig, controller, window_s=5.0)
     controller.send(block(1, (10, 10)))
-    link = made._link
-    async with asyncio.timeout(BOUND_S):
-        while not link._complete():
-            await asyncio.sleep(0.001)
-    for kept in link._kept.values():
-        kept[-1] = dataclasses.replace(kept[-1], time_s=kept[-1].time_s - 6.0)
+    await older_s(made, 6.0)
     with pytest.raises(DeviceTimeout, match="no new measurement"):
         await made.read()
     controller.send(block(2, (30, 30)))
