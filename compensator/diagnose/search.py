@@ -205,8 +205,10 @@ class Search:
                 if id(start[0]) in seen or start[0].place in apart_from:
                     continue
                 seen.add(id(start[0]))
-                if start[0].effect.jumps and self._starts_anywhere(fit):
-                    continue
+                if start[0].effect.jumps:
+                    if self._starts_anywhere(fit):
+                        continue
+                    start = self._at_its_sample(likelihood, fit, start)  # noqa: PLW2901
                 added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
                 if not self.criterion.is_plausible(added.terms[-1]):
                     continue
@@ -215,6 +217,22 @@ class Search:
                 ]
                 found.append(max([added, *others], key=self.criterion.score))
         return sorted(found, key=self.criterion.score, reverse=True)
+
+    def _at_its_sample(self, likelihood: Likelihood, fit: Fit, start: Start) -> Start:
+        """Return a jump at the sample near its point of the grid that suits it best.
+
+        What it leaves is no smooth function of its time: beside a large one a search ends where it begins.
+        """
+        hypothesis, (at_min, *_) = start
+        free, period_min = hypothesis.free[0], self.evidence.context.period_min
+        apart = max(round(float(np.max(np.diff(free.grid), initial=0.0)) / period_min), 0)
+        near = [at_min + i * period_min for i in range(-apart, apart + 1)]
+        fits = [
+            fit_terms(likelihood, [*fit.starts(), (hypothesis, (at,))], evaluations=1)
+            for at in near
+            if free.low <= at <= free.high
+        ]
+        return max(fits, key=lambda one: one.log_evidence).terms[-1].start
 
     def _exchanged(self, fit: Fit, count: int | None = None) -> Fit:
         """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.

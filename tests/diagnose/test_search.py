@@ -21,7 +21,7 @@ from compensator.model.model_file import load_model
 from compensator.report.diagnosis import tone_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.effects.mechanical import StickSlip
-from tests.diagnose.scenarios import KINDS, draw, mistimed, record
+from tests.diagnose.scenarios import KINDS, Scenario, draw, mistimed, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -48,6 +48,14 @@ def test_a_time_constant_that_changed_a_little_is_found(factor):
     (term,) = search([mistimed(factor)], 1300)
     assert term.hypothesis.place == ("dynamics", "DTF", "")
     assert term.named["tau_min"] == pytest.approx(20.92 * factor, rel=0.03)
+
+
+@pytest.mark.parametrize("at", [707, 1001])
+def test_a_large_step_is_found_at_its_sample(at):
+    """Beside it a search of its time ends where it begins, and a source switched on and off again looks better."""
+    jumped = Scenario(place=("step", "", ""), act=lambda signals: -25.0 * (np.arange(signals[0]) >= at))
+    (term,) = search([jumped], 1301, noise_um=0.1)
+    assert term.hypothesis.place == ("step", "", "") and term.named["at_min"] == pytest.approx(at, abs=0.5)
 
 
 @pytest.mark.parametrize("pair", [("input", "step"), ("gain DTF", "drift"), ("play", "input")])
