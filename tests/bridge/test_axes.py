@@ -23,7 +23,7 @@ from compensator.receiver import AxesFollower, AxesReceiver, AxesSettings, Contr
 from compensator.receiver.applied_record import applied_at
 from compensator.receiver.limits import Acceptance
 from tests.bridge.plc import Plc
-from tests.bridge.test_opcua import refused, until
+from tests.bridge.test_opcua import Clock, refused, until
 from tests.fuzz.mutation import mutated
 from tests.receiver.limits import MAX_UM, plain, sloped
 from tests.receiver.offsets import MACHINE, axis_offset, slope
@@ -108,7 +108,8 @@ async def bridging(path: Path, said: list[str]) -> AsyncIterator[AxesBridge]:
             await task
 
 
-async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
+async def test_all_axes_to_the_data_block_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
     zenoh, plc, said = free_port(), Plc(free_port(), value=0.002), []  # type: tuple[int, Plc, list[str]]
     path = written(tmp_path, plc.endpoint, zenoh)
 
@@ -150,11 +151,13 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path) -> None:
             await until(lambda: says("[incomplete]"), "a sample that is not whole")
             assert await holds(-13.0, -4.0, -20.0) and await plc.state.read_value() == 1
             # Somebody else writes Z: neither moves.
-            await plc.z.write_value(0.03, plc.kind)
-            await until(lambda: says("z: the PLC holds +30.000 µm instead of the written -4.000 µm"), "it is said")
-            publish(3, 20.0, -10.0, 20.0)
-            await asyncio.sleep(4 * CYCLE_S)
-            assert await holds(-13.0, 30.0, -20.0) and await plc.state.read_value() == 4
+            with clock.stopped():
+                await plc.z.write_value(0.03, plc.kind)
+                await until(lambda: says("z: the PLC holds +30.000 µm instead of the written -4.000 µm"), "it is said")
+                publish(3, 20.0, -10.0, 20.0)
+                beat = bridge._beat
+                await until(lambda: asyncio.sleep(0, bridge._beat >= beat + 4), "some cycles")
+                assert await holds(-13.0, 30.0, -20.0) and await plc.state.read_value() == 4
             await until(lambda: holds(-23.0, -10.0, -20.0), "both go on from what stands")
             # A write that is refused for one: no heartbeat, so that the PLC takes over nothing of it.
             await until(following, "all is written")

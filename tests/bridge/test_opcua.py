@@ -6,8 +6,8 @@ import asyncio
 import itertools
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,23 @@ async def until(
         await asyncio.sleep(0.02)
 
 
+class Clock:
+    """The clock of a bridge, which a test may stop: a busy computer may take longer than a time that must not pass."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._stopped_s: float | None = None
+        patch.setattr("compensator.bridge.opcua.monotonic_s", self)
+
+    def __call__(self) -> float:
+        return time.monotonic() if self._stopped_s is None else self._stopped_s
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        self._stopped_s = time.monotonic()
+        yield
+        self._stopped_s = None
+
+
 def refused(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """Return the one line with which a bridge refuses its settings."""
     assert main(["bridge", "opcua", "--config", str(path)]) == 2
@@ -97,7 +114,8 @@ def check(values: list[float]) -> None:
     assert len(values) > 1 and max(steps) <= STEP_UM, max(steps)
 
 
-async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> None:
+async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
     zenoh, plc, said = free_port(), Plc(free_port(), value=0.002), []  # type: tuple[int, Plc, list[str]]
     path = written(tmp_path, plc.endpoint, zenoh)
 
@@ -130,10 +148,11 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 await until(lambda: at(20.0), "it goes on")
                 await until(lambda: asyncio.sleep(0, said[-1] == "following"), "all is written")
                 # Somebody else writes: it stands, says so, and goes on from there once that stands.
-                await plc.put(-30.0)
-                await until(lambda: asyncio.sleep(0, "[plc_written_over]" in said[-1]), "the difference is said")
-                assert await at(-30.0) and await plc.state.read_value() == 4
-                count = len(plc.values)
+                with clock.stopped():
+                    await plc.put(-30.0)
+                    await until(lambda: asyncio.sleep(0, "[plc_written_over]" in said[-1]), "the difference is said")
+                    assert await at(-30.0) and await plc.state.read_value() == 4
+                    count = len(plc.values)
                 await until(lambda: at(20.0), "it goes on")
                 check(plc.values[count - 1 :])
                 # A write that is refused moves nothing and is tried again.
