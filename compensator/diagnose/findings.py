@@ -12,6 +12,7 @@ from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
+from compensator.diagnose.foresight import Foresight, foreseeing
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import MOSTLY, Search, Selection
@@ -50,6 +51,8 @@ class Findings:
         What the base's paths alone would explain, where nothing was known of them; 0 elsewhere, µm.
     refitted : Regressed or None
         The base's paths fitted together with the named effects, where nothing was known of them.
+    foresight : Foresight or None
+        How the drive moves, where a late T_Q was found.
     """
 
     search: Search
@@ -63,6 +66,7 @@ class Findings:
     channels: Regressed
     paths: Vector
     refitted: Regressed | None
+    foresight: Foresight | None = None
 
     @property
     def named(self) -> Vector:
@@ -95,7 +99,9 @@ class Findings:
         return float(np.hypot(rest.slow_um, rest.own_um))
 
 
-def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None) -> Findings:
+def findings_of(
+    evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None, foresight: Foresight | None = None
+) -> Findings:
     """Search in some evidence.
 
     Parameters
@@ -106,12 +112,14 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
         Whether an unobserved source is looked for.
     grid : Grid, optional
         That of a search over all data, where something is held out.
+    foresight : Foresight, optional
+        How the drive moves, by a search over all data that found a late T_Q.
     """
-    found = _findings_of(evidence, grid, unobserved=unobserved)
+    found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight)
     if evidence.is_sparse or all(term.effect.observed for term in found.terms) or _is_no_worse(found):
         return found
     # The effects make up for the source. Channels that explain most of it alone take their place.
-    shown = _findings_of(evidence, found.search.grid, unobserved=False)
+    shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
     rms = found.search.criterion.rms
     nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
     is_better = in_free_run(shown)[1] < in_free_run(found)[1]
@@ -139,10 +147,13 @@ def _is_no_worse(found: Findings) -> bool:
     return own_um <= base_um
 
 
-def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> Findings:
+def _findings_of(
+    evidence: Evidence, grid: Grid | None, *, unobserved: bool, foresight: Foresight | None = None
+) -> Findings:
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
-    fit, points = selection.fit, search.points
+    fit, foresight = foreseeing(selection.fit, foresight)
+    points = search.points
     nothing = np.zeros(points.count)
     background = Background(evidence)
     channels = background.fitted(points, nothing, selection.before.rest)
@@ -171,6 +182,7 @@ def _findings_of(evidence: Evidence, grid: Grid | None, *, unobserved: bool) -> 
         channels=channels,
         paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
         refitted=refitted,
+        foresight=foresight,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from compensator.arrays import Indices, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
 from compensator.diagnose.scan import Grid
 from compensator.model.effects.hypothesis import Place
@@ -54,7 +55,9 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     unobserved = any(hidden) and not all(hidden)
     # Another process computes the columns sooner than it gets them.
     grid = found.search.grid if executor_map is map else None
-    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=grid), views)
+    predicted = executor_map(
+        partial(_predictions, places=places, unobserved=unobserved, grid=grid, foresight=found.foresight), views
+    )
     left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
@@ -90,8 +93,10 @@ class _Predictions:
     has: Indices
 
 
-def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid | None) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved, grid=grid)
+def _predictions(
+    seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid | None, foresight: Foresight | None
+) -> _Predictions:
+    found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight)
     steps, total = [], found.own_paths
     for place in places:
         total = sum(

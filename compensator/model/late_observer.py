@@ -171,11 +171,12 @@ def late_variance_um2(model: ThermalModel) -> float:
     """Return by how much the correction of a late T_Q raises the steady variance of y, µm²."""
     if model.late_t_q is None:
         return 0.0
-    late_um2, prompt_um2 = (_steady_variance_um2(observer_of(m)) for m in (model, model.with_prompt_t_q()))
-    return max(late_um2 - prompt_um2, 0.0)
+    return max(steady_variance_um2(model) - steady_variance_um2(model.with_prompt_t_q()), 0.0)
 
 
-def _steady_variance_um2(observer: Observer) -> float:
+def steady_variance_um2(model: ThermalModel) -> float:
+    """Return the variance of y that the observer of a model states where nothing is missing, µm²."""
+    observer = observer_of(model)
     for _ in range(_STEADY_AFTER):
         observer.step(0.0, 0.0)
     return observer.y_variance_um2

@@ -9,6 +9,7 @@ T_Q − AT, K, in a direct model) and the ambient change *a* as random walks:
     y      = C₂ x₂ + D₂ q + C₃ x₃ + D₃ a
 
 The fourth path leads from the ambient to T_Q: 1, or the lag of a late T_Q, which is then in the first path, too.
+In a direct model with a late T_Q the drive may be behind *q* by a lag, which is then in every path from the drive.
 Further parts of a model, such as those of other axes, add a DTF and a TDTF each, driven by the same *q* and *a*;
 nothing leads from them to T_Q, so they leave the estimates of the others as they are.
 
@@ -89,11 +90,13 @@ class Observer:
     def __init__(self, model: ThermalModel) -> None:
         ttf = model.ttf.sampled if model.ttf else _UNITY
         ambient = _UNITY
-        late = model.late_t_q
+        late, walk_std = model.late_t_q, model.estimator.drive_walk_std
+        self._behind: SampledTransferFunction | None = None
         if late is not None:
             lag = late.within_a_sample(model.period_s, invertible=model.estimator.method == "inverse")
             ttf = ttf.times(lag)
             ambient = lag if late.of_ambient else _UNITY
+            self._behind, walk_std = late.behind(model.period_s), walk_std * late.walk_times
         tdtf = model.tdtf.sampled if model.tdtf else _ZERO
         estimator = model.estimator
         further = [
@@ -101,7 +104,13 @@ class Observer:
             for part in model.parts
             for function in (part.dtf.sampled, part.tdtf.sampled if part.tdtf else _ZERO)
         ]
-        self._lay_out(ttf, model.dtf.sampled, tdtf, ambient, *further)
+        dtf = model.dtf.sampled
+        if self._behind is not None:
+            # What walks is before the drive: it leads to T_Q, to every DTF, and to the drive itself, which comes last.
+            ttf, dtf, nothing = self._behind.times(ttf), self._behind.times(dtf), _ZERO
+            further = [self._behind.times(f) if i % 2 == 0 else f for i, f in enumerate(further)]
+            further += [self._behind, nothing]
+        self._lay_out(ttf, dtf, tdtf, ambient, *further)
         self._outputs = self._output_rows(model)
         weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
         self._covariance = Covariance(
@@ -110,7 +119,7 @@ class Observer:
                 first=tuple(self._first),
                 feed=tuple(self._d),
                 of_y=tuple((index, weight) for index, weight in weights if index < self.size),
-                walk=(*[0.0] * self._q, estimator.drive_walk_std**2, estimator.at_walk_std_k**2),
+                walk=(*[0.0] * self._q, walk_std**2, estimator.at_walk_std_k**2),
                 t_q_var_k2=estimator.t_q_noise_std_k**2,
                 at_var_k2=estimator.at_noise_std_k**2,
                 kalman=estimator.method == "kalman",
@@ -220,7 +229,8 @@ class Observer:
 
     def drive_for(self, t_q_k: float) -> float:
         """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
-        return self._x[self._q] + (t_q_k / self._d[0] if self._d[0] != 0.0 else math.copysign(math.inf, t_q_k))
+        feed = self._d[0] / (self._d[-2] if self._behind is not None else 1.0)
+        return self.drive + (t_q_k / feed if feed != 0.0 else math.copysign(math.inf, t_q_k))
 
     # ------------------------------------------------------------------ estimates
 
@@ -247,6 +257,8 @@ class Observer:
     @property
     def drive(self) -> float:
         """Estimated heat, W (T_Q − AT, K, in a direct model)."""
+        if self._behind is not None:
+            return self._x[self._first[-2]] + self._d[-2] * self._x[self._q]
         return self._x[self._q]
 
     @property
@@ -262,6 +274,8 @@ class Observer:
     @property
     def drive_std(self) -> float:
         """Standard deviation of the drive, in its unit."""
+        if self._behind is not None:
+            return math.sqrt(self._covariance.variances_of([[(self._first[-2], 1.0), (self._q, self._d[-2])]])[0])
         return math.sqrt(max(float(self._covariance.p[self._q, self._q]), 0.0))
 
     @property

@@ -16,6 +16,7 @@ from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
 from compensator.identify.calibration import predict
+from compensator.model.effects.delay import DelayedSensor
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -95,6 +96,45 @@ def test_what_a_dead_time_hides_another_channel_shows() -> None:
     deployed = parse_model(dump_model(found.model).encode(), source="model.toml")
     corrected = dataclasses.replace(deployed, effects=(effect.effect,))
     assert error(deployed, run, true) < 0.6 * error(corrected, run, true)
+
+
+def direct_run(seed: int, hours: float, delay_min: float) -> tuple[Run, np.ndarray]:
+    """A run of the direct model's machine with a late T_Q, and its true deformation."""
+    t_q, at, _ = run_of(seed, hours, 0.01, form="sensor", lag_min=0.0, delay_min=delay_min)
+    _, _, _, ambient, _, _, difference = signals(seed, hours)
+    base = direct("kalman")
+    assert base.tdtf is not None
+    y = base.dtf.sampled.response(difference) + base.tdtf.sampled.response(ambient)
+    noise_um = np.random.default_rng(seed).normal(0.0, 0.1, y.size)
+    return runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise_um})[0], y
+
+
+def test_how_the_drive_goes_on_is_learned_with_a_late_t_q() -> None:
+    """T_Q − AT of a direct model does not stay where it is: what a dead time hides of it is foreseen in part."""
+    base = direct("kalman")
+    [effect] = diagnose(base, [direct_run(1108, 36.0, 10.0)[0]]).effects
+    late = effect.effect
+    assert isinstance(late, DelayedSensor) and late.behind_min > 1.0
+    stays = dataclasses.replace(late, walk_times=1.0, behind_min=0.0)
+    fresh, true = direct_run(5108, 24.0, 10.0)
+    prompt = error(base, direct_run(5108, 24.0, 0.0)[0], true)
+    held, foreseen = (error(dataclasses.replace(base, effects=(one,)), fresh, true) for one in (stays, late))
+    assert foreseen - prompt < 0.6 * (held - prompt)
+
+
+def test_how_fast_the_heat_moves_is_learned_with_a_late_t_q() -> None:
+    """A calibration with hardly a change of the heat says that it hardly moves, and the correction comes late."""
+    calm = dataclasses.replace(QUILL, estimator=dataclasses.replace(QUILL.estimator, drive_walk_std=0.5))
+    columns, _, _ = record([sensor(0.0, 2.0)], 1109, 36.0)
+    [effect] = diagnose(calm, runs_from(columns)).effects
+    late = effect.effect
+    assert isinstance(late, DelayedSensor) and late.walk_times > 2.0 and late.behind_min == 0.0
+    fresh, true, _ = record([sensor(0.0, 2.0)], 5109, 24.0)
+    before, after = (
+        error(dataclasses.replace(calm, effects=(one,)), runs_from(fresh)[0], true)
+        for one in (dataclasses.replace(late, walk_times=1.0), late)
+    )
+    assert after < 0.5 * before
 
 
 def test_no_dead_time_is_none() -> None:

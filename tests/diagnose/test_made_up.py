@@ -87,8 +87,8 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     searched = []
     once = module._findings_of
 
-    def noted(evidence: Any, grid: Any, *, unobserved: bool) -> Any:
-        searched.append(once(evidence, grid, unobserved=unobserved))
+    def noted(evidence: Any, grid: Any, **asked: Any) -> Any:
+        searched.append(once(evidence, grid, **asked))
         return searched[-1]
 
     monkeypatch.setattr(module, "_findings_of", noted)

@@ -13,10 +13,11 @@ from scipy.signal import lfilter
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from
 from compensator.model.engine import Engine
-from compensator.model.late_observer import observe
+from compensator.model.late_observer import observe, observer_of
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
-from compensator.model.thermal_model import ThermalModel
+from compensator.model.thermal_model import Path, ThermalModel
+from compensator.model.transfer_function import SampledTransferFunction
 from tests.diagnose.scenarios import signals
 from tests.service.records import QUILL, direct, late, with_method
 
@@ -142,6 +143,47 @@ def test_a_direct_model_too(form: str) -> None:
         assert after < 1.1 * prompt
 
 
+def behind(behind_min: float, walk_times: float, **changes: Any) -> ThermalModel:
+    return late(direct("kalman"), path="DTF", walk_times=walk_times, behind_min=behind_min, **changes)
+
+
+def test_a_drive_that_goes_on_is_foreseen() -> None:
+    """T_Q − AT does not stay where it is when the heat has changed: what a dead time hides is foreseen in part."""
+    base = direct("kalman")
+    _, _, _, ambient, _, _, difference = signals(3, 24.0)
+    assert QUILL.tdtf is not None
+    y = base.dtf.sampled.response(difference) + QUILL.tdtf.sampled.response(ambient)
+    t_q, at, _ = run_of(3, 24.0, 0.005, form="sensor", lag_min=0.0, delay_min=8.0)
+    stays = late(base, path="DTF", lag_min=0.0, delay_min=8.0)
+    goes_on = behind(20.0, 20.0, lag_min=0.0, delay_min=8.0)
+    held, foreseen = (rms(predicted(m, t_q, at)[0] - y) for m in (stays, goes_on))
+    t_q, at, _ = run_of(3, 24.0, 0.005, form="sensor", lag_min=0.0, delay_min=0.0)
+    prompt = rms(predicted(base, t_q, at)[0] - y)
+    assert foreseen**2 - prompt**2 < 0.4 * (held**2 - prompt**2)
+
+
+def test_a_drive_behind_what_moves_is_one_behind_a_ttf() -> None:
+    """The direct model has the deformation of a model with that lag as its TTF; its drive stays T_Q − AT, K."""
+    model = behind(9.0, 3.0, delay_min=2.5, lag_min=3.0)
+    lag = SampledTransferFunction(b=(0.1,), a=(1.0, -0.9), period_s=60.0)
+    estimator = dataclasses.replace(model.estimator, drive_walk_std=3.0 * model.estimator.drive_walk_std)
+    ttf, dtf = Path(sampled=lag, unit="K/W"), Path(sampled=lag.times(model.dtf.sampled), unit="um/W")
+    same = dataclasses.replace(model, kind="heat", ttf=ttf, dtf=dtf, estimator=estimator, effects=())
+    same = late(same, delay_min=2.5, lag_min=3.0)
+    t_q, at, _ = run_of(4, 12.0, 0.02, form="sensor", lag_min=3.0, delay_min=2.5)
+    ours, theirs = (observe(m, t_q - 20.0, at - 20.0) for m in (model, same))
+    np.testing.assert_allclose(ours.y_dtf_um, theirs.y_dtf_um, rtol=0, atol=1e-9)
+    difference = signals(4, 12.0)[6]
+    assert rms(ours.drive - difference) < 0.1 * rms(difference)
+    assert observer_of(model).drive_for(1.0) == pytest.approx(8.0)
+    past = observer_of(model)
+    for t, a in zip((t_q - 20.0)[:300].tolist(), (at - 20.0)[:300].tolist(), strict=True):
+        past.step(t, a)
+    again = observer_of(model)
+    again.restore(past.snapshot())
+    assert (again.drive, again.shares_um(), again.drive_std) == (past.drive, past.shares_um(), past.drive_std)
+
+
 @pytest.mark.parametrize("method", ["kalman", "inverse"])
 def test_the_record_at_once_has_the_bits_of_the_stream(method: str) -> None:
     t_q, at, _ = run_of(4, 12.0, 0.02, form="sensor", lag_min=3.0, delay_min=2.5)
@@ -218,6 +260,11 @@ def test_the_file_keeps_it() -> None:
     again = parse_model(dump_model(model).encode(), source="late")
     assert again.effects == model.effects
     assert again.late_t_q == model.late_t_q
+    assert "walk_times" not in dump_model(model) and "behind_min" not in dump_model(model)
+    foreseeing = behind(7.0, 2.0)
+    again = parse_model(dump_model(foreseeing).encode(), source="late")
+    assert again.effects == foreseeing.effects
+    assert again.late_t_q is not None and (again.late_t_q.walk_times, again.late_t_q.behind_min) == (2.0, 7.0)
     # A table of version 0.1.0 has no form: it is a late path of the deformation.
     assert effect_from("delay", {"path": "DTF", "delay_min": 1.0, "lag_min": 0.0}).lateness is None
 
@@ -228,6 +275,7 @@ def test_the_file_keeps_it() -> None:
         (QUILL, [{}, {}], "2 effects of a late T_Q"),
         (QUILL, [{"path": "DTF"}], "path = 'DTF', expected 'TTF'"),
         (direct("kalman"), [{"path": "TTF"}], "path = 'TTF', expected 'DTF'"),
+        (QUILL, [{"behind_min": 5.0}], "behind_min = 5.0, expected 0"),
     ],
 )
 def test_what_cannot_be_run_is_refused(model: ThermalModel, tables: list[dict[str, Any]], words: str) -> None:

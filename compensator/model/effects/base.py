@@ -38,6 +38,15 @@ def number(low: float = -math.inf, high: float = math.inf) -> Any:
     return dataclasses.field(metadata={"read": lambda table, key: table.number(key, low, high)})
 
 
+def optional_number(low: float = -math.inf, high: float = math.inf, *, default: float) -> Any:
+    """Return a parameter that the model file holds or, where it is the default, leaves out: a number between bounds."""
+
+    def read(table: TomlTable, key: str) -> float:
+        return table.number(key, low, high) if key in table.table else default
+
+    return dataclasses.field(default=default, metadata={"read": read, "optional": True})
+
+
 def numbers(low: float = -math.inf, high: float = math.inf) -> Any:
     """Return a parameter that the model file holds: a list of numbers between two bounds."""
     return dataclasses.field(metadata={"read": lambda table, key: table.numbers(key, low, high, most=MODES)})
@@ -229,7 +238,11 @@ class Effect:
 
     def to_table(self) -> dict[str, Any]:
         """Return its `[[effect]]` table, without the kind."""
-        table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
+        fields = [f for f in dataclasses.fields(self) if "read" in f.metadata]
+        table = {f.name: getattr(self, f.name) for f in fields}
+        for f in fields:
+            if "optional" in f.metadata and table[f.name] == f.default:
+                del table[f.name]
         found = {key: _as_list(value) for key, value in table.items()}
         return found | {key: _as_list(value) for key in _FOUND if (value := getattr(self, key))}
 
@@ -293,7 +306,7 @@ _loaded = False
 @dataclass_transform(
     frozen_default=True,
     kw_only_default=True,
-    field_specifiers=(number, numbers, rows, optional_rows, text, texts, only),
+    field_specifiers=(number, optional_number, numbers, rows, optional_rows, text, texts, only),
 )
 def register(form: type[_E]) -> type[_E]:
     """Make a form of a kind of effect a frozen dataclass, and register it (class decorator)."""

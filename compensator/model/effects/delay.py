@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from compensator.arrays import Matrix
-from compensator.model.effects.base import Effect, Run, number, register, text
+from compensator.errors import ModelError
+from compensator.model.effects.base import Effect, Run, number, optional_number, register, text
 from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, proposes
 from compensator.model.effects.lateness import Lateness
@@ -57,6 +58,12 @@ class DelayedSensor(DelayedPath):
     form: str = text("sensor", "path")
     delay_min: float = number(0.0, 240.0)
     lag_min: float = number(0.0, 240.0)
+    walk_times: float = optional_number(1e-3, 1e3, default=1.0)
+    behind_min: float = optional_number(0.0, 240.0, default=0.0)
+
+    def check_base(self, kind: str) -> None:
+        if self.behind_min > 0.0 and kind != "direct":
+            raise ModelError(f"effect delay of T_Q: behind_min = {self.behind_min!r}, expected 0 in a model with a TTF")
 
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         return ()
@@ -67,7 +74,13 @@ class DelayedSensor(DelayedPath):
 
     @property
     def lateness(self) -> Lateness:
-        return Lateness(lag_min=self.lag_min, delay_min=self.delay_min, of_ambient=self.form == "sensor")
+        return Lateness(
+            lag_min=self.lag_min,
+            delay_min=self.delay_min,
+            of_ambient=self.form == "sensor",
+            walk_times=self.walk_times,
+            behind_min=self.behind_min,
+        )
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         """Return what the share would have been with an immediate sensor, less what it is; it uses the future."""

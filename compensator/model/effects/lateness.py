@@ -10,7 +10,10 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lateness:
-    """Lag and dead time of T_Q.
+    """Lag and dead time of T_Q, and how the drive moves that is estimated from it.
+
+    The later T_Q is, the more depends on what the drive is expected to do: it says how much of a change of T_Q is
+    believed, and how the drive goes on where T_Q does not show it yet.
 
     Parameters
     ----------
@@ -18,15 +21,25 @@ class Lateness:
         Time constant of a first-order lag, and dead time, min.
     of_ambient : bool
         Whether the ambient's change reaches T_Q as late as the heat does: the sensor is late, and not the heat's way.
+    walk_times : float
+        The drive changes in one sample by this many times what the estimator says.
+    behind_min : float
+        In a direct model, T_Q − AT is behind what changes so by this first-order lag, min: it goes on after a change.
     """
 
     lag_min: float
     delay_min: float
     of_ambient: bool
+    walk_times: float = 1.0
+    behind_min: float = 0.0
 
     def samples(self, period_s: float) -> int:
         """Return the whole samples of the dead time."""
         return math.floor(self.delay_min * 60.0 / period_s)
+
+    def behind(self, period_s: float) -> SampledTransferFunction | None:
+        """Return the lag of T_Q − AT behind what changes, if it has one."""
+        return _lag(self.behind_min * 60.0 / period_s, period_s) if self.behind_min > 0.0 else None
 
     def within_a_sample(self, period_s: float, *, invertible: bool) -> SampledTransferFunction:
         """Return the lag, and what whole samples leave of the dead time.
