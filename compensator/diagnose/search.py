@@ -153,7 +153,7 @@ class Search:
         """
         while len(best.terms) < MOST and not self.criterion.is_expected(best):
             proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
-            # A source with many switchings looks poor until the rest is settled with it, which takes more steps than one.
+            # A source with many switchings looks poor until the rest is settled with it, which takes more steps.
             candidates = [settled(fit) for fit in proposed[:JUDGED] if fit.terms[-1].hypothesis.effect.observed]
             sources = [fit for fit in proposed if not fit.terms[-1].hypothesis.effect.observed]
             candidates += [settled(settled(fit)) for fit in sources]
