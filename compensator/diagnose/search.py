@@ -153,10 +153,9 @@ class Search:
         """
         while len(best.terms) < MOST and not self.criterion.is_expected(best):
             proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
-            # A source with many switchings looks poor until the rest is settled with it, which takes more steps.
-            candidates = [settled(fit) for fit in proposed[:JUDGED] if fit.terms[-1].hypothesis.effect.observed]
-            sources = [fit for fit in proposed if not fit.terms[-1].hypothesis.effect.observed]
-            candidates += [settled(settled(fit)) for fit in sources]
+            # A source with many switchings looks poor until the rest is settled with it.
+            late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
+            candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.criterion.score, default=best)
             if self.criterion.score(better) <= self.criterion.score(best):
                 return best, self._undecided(candidates, best)
@@ -200,7 +199,7 @@ class Search:
         seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
             ranked: Iterable[Start] = self._scan.ranked(rest, fit, self.criterion.cost_of)[:FITTED]
-            if unobserved and all(t.hypothesis.effect.observed for t in fit.terms):
+            if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
             for start in ranked:
                 if id(start[0]) in seen or start[0].place in apart_from:
@@ -270,12 +269,8 @@ class Search:
         return fit
 
     def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
-        """Yield a source that no channel shows, where it may compete with the effects found.
-
-        Those of other rests do not count: they may have the wrong number of switchings, and are compared later.
-        """
-        effects = [other for other in found if other.terms[-1].hypothesis.effect.observed]
-        best = max((other.log_evidence for other in effects), default=fit.log_evidence)
+        """Yield a source that no channel shows, where it may compete with the effects found."""
+        best = max((other.log_evidence for other in found), default=fit.log_evidence)
         if source := switchings(rest, fit, best - fit.log_evidence):
             yield source
 
