@@ -106,7 +106,7 @@ def diagnose(
         return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
     few = evidence.is_sparse
     reverses = any(effect.reverses_path for effect in effects)
-    worse_um = _worse_in_free_run(found) or _lateness_helps_nothing(found)
+    worse_um = _worse_in_free_run(found)
     refused = _contradicted(found, held_out) or reverses or worse_um is not None
     if refused:
         effects = _not_replaced(effects)
@@ -223,9 +223,14 @@ def _contradicted(found: Findings, held_out: HeldOut) -> bool:
 
 
 def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
-    """Return what is left in free run without and with what would be deployed, µm rms, if that is clearly worse."""
+    """Return what is left in free run without and with what would be deployed, µm rms, if that is clearly worse.
+
+    With a late T_Q, if it is worse at all: that acts at every change of the heat, so on this record as on others. Where
+    noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
+    """
     base_um, own_um = in_free_run(found)
-    is_worse = not found.search.evidence.is_sparse and own_um > CONTRADICTS * base_um
+    is_late = found.explains and late_term(found.selection.fit) is not None
+    is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else CONTRADICTS) * base_um
     return (base_um, own_um) if is_worse else None
 
 
@@ -235,17 +240,6 @@ def _foretells_better(found: Findings, held_out: HeldOut) -> bool:
     Both errors are of data that took no part: those of held-out blocks, and the base's own in free run.
     """
     return in_free_run(found)[0] < rms_of(held_out.whole)
-
-
-def _lateness_helps_nothing(found: Findings) -> tuple[float, float] | None:
-    """Return the same where a late T_Q is among what would be deployed, if that is worse at all.
-
-    It acts at every change of the heat, so on this record as on others. Where noise and the minutes that T_Q hides
-    leave the engine nothing of it, its correction is noise.
-    """
-    base_um, own_um = in_free_run(found)
-    is_late = found.explains and late_term(found.selection.fit) is not None
-    return (base_um, own_um) if is_late and not found.search.evidence.is_sparse and own_um > base_um else None
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:
