@@ -260,11 +260,14 @@ def test_the_plot_of_a_frame_is_that_of_the_result_and_with_arguments_that_of_pa
 
 
 @pytest.mark.parametrize(
-    ("known", "unseen"), [("first", (False, True)), ("nothing", (False, False)), ("a text", (False, False))]
+    ("known", "unseen"),
+    [("first", (False, True)), ("validated", (True, False)), ("nothing", (False, False)), ("a text", (False, False))],
 )
 def test_whether_a_model_has_seen_the_data_is_known_by_their_hash(known: str, unseen: tuple[bool, bool]) -> None:
     both = [SMALL, SMALL | {"t_q_degc": [20.0, 21.0, 23.0]}]
     first, second = (measurements(one, "data", None, needed=True) for one in both)
-    data = {"first": [{"sha256": first[0].origins[0].sha256}, 1], "nothing": [], "a text": "first"}[known]
+    one, other = ({"role": "fit", "sha256": each[0].origins[0].sha256} for each in (first, second))
+    validated = [one | {"role": "validation"}, other]
+    data = {"first": [one, 1], "validated": validated, "nothing": [], "a text": "first"}[known]
     model = dataclasses.replace(tc.load_model("quill"), provenance={"data": data})
     assert (_is_unseen(model, first), _is_unseen(model, second)) == unseen
