@@ -420,8 +420,8 @@ def _diagnosed(
 def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
     """Return whether a model was calibrated, and on none of these data. What only validated it was not seen."""
     named = base.provenance.get("data")
-    fitted = [one for one in named if isinstance(one, dict)] if isinstance(named, list) else []
-    known = [one.get("sha256") for one in fitted if one.get("role") != "validation"]
+    sources = [one for one in named if isinstance(one, dict)] if isinstance(named, list) else []
+    known = [one.get("sha256") for one in sources if one.get("role") != "validation"]
     return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 

@@ -38,6 +38,22 @@ class Wire:
         assert select.select([self.fd], [], [], PATIENCE_S)[0]
         return os.read(self.fd, 4096)
 
+    def in_pieces(self, faults, ask, sizes):
+        """Ask for a reply that is split into pieces of these sizes, and return what each read gives.
+
+        A starved computer may read two pieces at once: only then is the pause between them made longer.
+        """
+        pieces = []
+        for pause_s in (0.02, 0.2, 1.5):
+            faults.set("split", times=1, pieces=len(sizes), pause_s=pause_s)
+            ask()
+            pieces = [self.once()]
+            while pieces[-1] and sum(map(len, pieces)) < sum(sizes):
+                pieces.append(self.once())
+            if [len(piece) for piece in pieces] == sizes:
+                break
+        return pieces
+
     def ask(self, data, size):
         self.send(data)
         return self.receive(size).hex()

@@ -199,9 +199,8 @@ def test_garbage_has_no_preamble(controller, data):
 
 
 def test_split_and_joined_blocks(controller, data):
-    controller.faults.set("split", times=1, pieces=2, pause_s=0.02)
-    controller.push(1)
-    assert [len(data.once()), len(data.once())] == [20, 20]
+    pieces = data.in_pieces(controller.faults, lambda: controller.push(1), [20, 20])
+    assert [len(piece) for piece in pieces] == [20, 20]
     controller.faults.set("join", times=1)
     controller.push(1)
     controller.push(1)
