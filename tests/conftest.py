@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from compensator.blas import one_thread_from_start
 from tests.shared_folder import search_once
@@ -20,6 +21,9 @@ from tests.shared_folder import search_once
 one_thread_from_start()
 # A shell starts what runs in the background with SIGINT ignored, and so would every program that a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# The same draws in every run. `pytest --hypothesis-profile default` draws others each time, to find what these miss.
+settings.register_profile("fixed", derandomize=True, database=None)
+settings.load_profile("fixed")
 
 
 def _no_wait_for_the_disk(descriptor: int) -> None:

@@ -18,7 +18,7 @@ from compensator.recording.reading import last_value, read_messages
 from tests.audit.made import Service
 from tests.audit.tampering import rewrite
 
-FUZZ = settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FUZZ = settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @pytest.fixture(scope="module")

@@ -201,7 +201,7 @@ def test_it_does_not_start_like_this(
     assert expected in refused(written(tmp_path, **{old: new}), capsys)
 
 
-@settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**32))
 def test_whatever_stands_in_the_file_it_is_loaded_or_refused_in_one_line(tmp_path: Path, seed: int) -> None:
     path = written(tmp_path)

@@ -26,7 +26,7 @@ from tests.service.records import QUILL, day
 from tests.service.simulated import TABLE as TABLES
 from tests.service.simulated import config
 
-FUZZ = settings(max_examples=50, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FUZZ = settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
 FEW = settings(FUZZ, max_examples=15)
 SEED = st.integers(0, 2**32)
 #: A configuration with a device of every family, as an engineer writes it.

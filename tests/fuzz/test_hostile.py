@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz.hostile import KINDS, attempt
 
-FEW = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if not kind.startswith("payloads")])

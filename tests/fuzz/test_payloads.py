@@ -17,7 +17,7 @@ from tests.fuzz.attacked_receiver import Attack
 from tests.fuzz.payloads import payload
 from tests.receiver.offsets import MACHINE, T0_NS, axis_offset, offset, slope
 
-FUZZ = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FUZZ = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @settings(FUZZ, max_examples=300)
