@@ -95,6 +95,9 @@ class EstimateMessage(Message, frozen=True, kw_only=True):
     ----------
     t_q_ref_degc, at_ref_degc, y_ref_um : float or None
         Zero of the two temperatures and of the measured deformation.
+    t_q_shift_k, at_shift_k : float, optional
+        By how much the sensor of the temperature shows more than the one that the model was made with, K; only after
+        a jump that was accepted as another zero of the sensor.
     heat_w, heat_std_w : float or None
         Estimated heat and its standard deviation, W.
     y_dtf_um, y_tdtf_um, y_effects_um
@@ -112,6 +115,8 @@ class EstimateMessage(Message, frozen=True, kw_only=True):
     t_q_ref_degc: float | None
     at_ref_degc: float | None
     y_ref_um: float | None
+    t_q_shift_k: float | UnsetType = UNSET
+    at_shift_k: float | UnsetType = UNSET
     heat_w: float | None
     heat_std_w: float | None
     y_dtf_um: float | None

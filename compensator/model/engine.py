@@ -125,7 +125,7 @@ class EngineState:
     gap : Gap, optional
         The gap under way.
     shifted_k : tuple of (float, float)
-        By how much T_Q and AT show more than they did at the zero, because their sensors have others, K.
+        By how much the sensors of T_Q and AT show more than those that the model was made with, K.
     """
 
     observer: ObserverState
@@ -236,6 +236,11 @@ class Engine:
         return not (math.isnan(self._reference.t_q_degc) or math.isnan(self._reference.at_degc))
 
     @property
+    def shifted_k(self) -> tuple[float, float]:
+        """By how much the sensors of T_Q and AT show more than those that the model was made with, K."""
+        return self._shifted_k
+
+    @property
     def contribution_names(self) -> tuple[str, ...]:
         """Names of what adds to the deformation: the two paths, and each effect with its number and label."""
         effects = (f"{number} {effect.label}" for number, effect in enumerate(self.model.effects, start=1))
@@ -246,8 +251,16 @@ class Engine:
         """Standard deviation of y that sensor noise and missing samples cause, µm; a part of `Estimate.y_std_um`."""
         return math.sqrt(self._observer.y_variance_um2)
 
-    def set_reference(self, t_q_degc: float, at_degc: float) -> None:
+    def set_reference(self, t_q_degc: float, at_degc: float, shifted_k: tuple[float, float] | None = None) -> None:
         """Start at rest, with these temperatures as zero (ignored where the model's inputs are absolute).
+
+        Parameters
+        ----------
+        t_q_degc, at_degc : float
+            Temperatures at the zero, °C.
+        shifted_k : tuple of (float, float), optional
+            By how much the sensors of T_Q and AT show more than those that the model was made with, K; by default as
+            before: a zero does not exchange a sensor.
 
         Raises
         ------
@@ -258,7 +271,8 @@ class Engine:
             raise ModelError("a zero needs both temperatures; one is missing")
         if self.model.inputs == "changes":
             self._reference = Reference(t_q_degc, at_degc)
-        self._shifted_k = (0.0, 0.0)
+        if shifted_k is not None:
+            self._shifted_k = shifted_k
         self._observer.reset()
         self._start_effects()
         self._held = {}

@@ -178,7 +178,7 @@ class Compensation(Continuity):
             further = tuple(others)
         return Outcome(
             sample=sample,
-            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, prediction, axes),
+            estimate=estimate_message(sample, values, estimate, self._engine, self._zero, prediction, axes),
             offset=offset,
             notes=tuple(notes),
             probes=decided,

@@ -95,11 +95,7 @@ class Continuity:
         return CompensationStatus(
             seq=memory.seq,
             time_utc_ns=memory.time_utc_ns,
-            zero=(
-                Zero.of_references(self._engine.reference, zero, self.outputs.states)
-                if self._engine.has_reference
-                else None
-            ),
+            zero=(Zero.of_references(self._engine, zero, self.outputs.states) if self._engine.has_reference else None),
             is_known=memory.cold_min <= 0.0,
             target_um=0.0 - prediction.y_um,
             std_um=prediction.std_um,
@@ -265,7 +261,7 @@ class Continuity:
         if zero is None:
             self._zero = ZeroState()
             return
-        self._engine.set_reference(zero.t_q_ref_degc, zero.at_ref_degc)
+        self._engine.set_reference(zero.t_q_ref_degc, zero.at_ref_degc, (zero.t_q_shift_k, zero.at_shift_k))
         self._zero = ZeroState(y_ref=zero.y_ref_um, y_base=zero.y_base_um)
         self._pass_cold(self._cold_samples)
 

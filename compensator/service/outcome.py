@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec import UNSET
 
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.events import Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Probe, Sample, number
 from compensator.messages_axes import AxesEstimate, AxisOffset
-from compensator.model.engine import Estimate, Reference
+from compensator.model.engine import Engine, Estimate
 from compensator.service.state import ZeroState
 
 
@@ -74,7 +75,7 @@ def estimate_message(
     sample: Sample,
     values: Values,
     estimate: Estimate | None,
-    reference: Reference,
+    engine: Engine,
     zero: ZeroState,
     prediction: Prediction,
     axes: dict[str, float | list[float] | None] | None = None,
@@ -83,7 +84,8 @@ def estimate_message(
 
     `axes` are the values of further axes by name; None on a machine with Y alone.
     """
-    y = values.y - zero.y_ref
+    y, reference = values.y - zero.y_ref, engine.reference
+    t_q_shift_k, at_shift_k = engine.shifted_k
     own = EstimateMessage(
         schema=SCHEMA,
         machine=sample.machine,
@@ -92,6 +94,8 @@ def estimate_message(
         t_q_ref_degc=reference.t_q_degc,
         at_ref_degc=reference.at_degc,
         y_ref_um=zero.y_ref,
+        t_q_shift_k=t_q_shift_k or UNSET,
+        at_shift_k=at_shift_k or UNSET,
         heat_w=estimate.heat_w if estimate else NAN,
         heat_std_w=estimate.heat_std_w if estimate else NAN,
         y_dtf_um=estimate.y_dtf_um if estimate else NAN,

@@ -9,7 +9,7 @@ import msgspec
 
 from compensator.messages import EstimateMessage, number
 from compensator.messages_axes import AxesEstimate, further_bases
-from compensator.model.engine import Reference
+from compensator.model.engine import Engine, EngineState
 from compensator.service.axes import OutputState
 from compensator.service.probing import ProbingHandover
 from compensator.service.state import ZeroMode, ZeroState
@@ -24,6 +24,8 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
         Temperatures, °C.
     y_ref_um : float
         Measured deformation, µm.
+    t_q_shift_k, at_shift_k : float
+        By how much the sensors show more than those that the model was made with, K.
     y_base_um : float
         Predicted deformation at the last zero on a warm machine, µm.
     further : mapping of str to float
@@ -34,6 +36,8 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
     at_ref_degc: float
     y_ref_um: float
     y_base_um: float
+    t_q_shift_k: float = 0.0
+    at_shift_k: float = 0.0
     further: Mapping[str, float] = {}
 
     @classmethod
@@ -44,6 +48,8 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
             at_ref_degc=number(estimate.at_ref_degc),
             y_ref_um=number(estimate.y_ref_um),
             y_base_um=estimate.y_base_um,
+            t_q_shift_k=estimate.t_q_shift_k or 0.0,
+            at_shift_k=estimate.at_shift_k or 0.0,
             further=further_bases(estimate) if isinstance(estimate, AxesEstimate) else {},
         )
 
@@ -54,13 +60,16 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
         return zero if zero is not None and not math.isnan(zero.t_q_ref_degc) else None
 
     @classmethod
-    def of_references(cls, reference: Reference, zero: ZeroState, axes: Mapping[str, OutputState]) -> Zero:
+    def of_references(cls, engine: Engine | EngineState, zero: ZeroState, axes: Mapping[str, OutputState]) -> Zero:
         """Return the zero of a state, from the engine's reference, those of Y, and further outputs by name."""
+        reference, shifted_k = engine.reference, engine.shifted_k
         return cls(
             t_q_ref_degc=reference.t_q_degc,
             at_ref_degc=reference.at_degc,
             y_ref_um=zero.y_ref,
             y_base_um=zero.y_base,
+            t_q_shift_k=shifted_k[0],
+            at_shift_k=shifted_k[1],
             further={name: one.base for name, one in axes.items()},
         )
 

@@ -271,6 +271,22 @@ def test_a_sensor_with_another_zero_does_not_move_what_acts_by_its_temperature(m
     assert y_of(found) == pytest.approx(y_of(expected), abs=1e-9)
 
 
+def test_a_zero_does_not_exchange_a_sensor() -> None:
+    """The couple reads 3 K more; after a zero it does so still, and coolant takes what it takes from the machine."""
+    table = {"form": "flow", "channel": "flow_lpm", "fluid": "coolant_degc", "span": 10.0, "half": 0.5}
+    effect = effect_from("input", table | {"tau_min": [20.0], "gain": [0.5], "gain_air": [0.2]})
+    engine = Engine(dataclasses.replace(load_model("quill"), effects=(effect,)))
+    # The pump starts after 10 min, with coolant as warm as the machine.
+    pump = [{"flow_lpm": 10.0 * (i >= 10), "coolant_degc": 15.0} for i in range(60)]
+    engine.set_reference(15.0, 15.0)
+    engine.shift_reference(3.0, -1.0)
+    for _ in range(2):
+        engine.set_reference(18.0, 14.0)
+        assert y_of([engine.step(18.0, 14.0, channels) for channels in pump]) == pytest.approx(0.0, abs=1e-9)
+    engine.set_reference(18.0, 14.0, (0.0, 0.0))
+    assert min(y_of([engine.step(18.0, 14.0, channels) for channels in pump])) < -0.5
+
+
 def test_unknown_effect_is_named() -> None:
     with pytest.raises(ModelError, match=r"effect 1 has kind 'magic', expected one of: .*gain"):
         parse_model(f'{TEXT}\n[[effect]]\nkind = "magic"\n'.encode(), source="written")

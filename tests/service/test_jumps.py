@@ -7,15 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from compensator.cli import main
 from compensator.config import parse_config
 from compensator.errors import ConfigError
-from compensator.messages import encode, number
+from compensator.messages import EstimateMessage, encode, number
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state
+from compensator.service.status import Zero
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.audit.test_signatures import write_key
 from tests.service.records import QUILL, direct, sample
@@ -319,6 +321,29 @@ def test_an_operator_decides(day: dict[str, np.ndarray], how: str) -> None:
         assert abs(grown - right) < 1.5
     else:
         assert abs(offsets(outcomes)[-1] - offsets(healthy)[-1]) > 10.0  # 6 K too warm, as the operator said
+
+
+def test_another_zero_of_a_sensor_is_recorded_and_known_to_what_begins_from_the_record(
+    day: dict[str, np.ndarray],
+) -> None:
+    """What acts by the temperature itself needs the shift; without it, it would act on one that is off by 6 K."""
+
+    def act(i: int, compensation: Compensation) -> None:
+        if i == BEGIN + 60:
+            compensation.zero("warm")
+        zeros.append(compensation.status.zero)
+
+    zeros: list[Zero | None] = []
+    outcomes = run(day, biased("t_q_degc", 6.0, end=10_000), act)
+    assert b"shift_k" not in encode(outcomes[BEGIN].estimate)
+    last = outcomes[-1].estimate
+    assert last.t_q_shift_k == pytest.approx(6.0, abs=0.2) and b"at_shift_k" not in encode(last)
+    recorded = Zero.of_estimate(msgspec.json.decode(encode(last), type=EstimateMessage))
+    assert zeros[-1] is not None and recorded.equals(zeros[-1])
+    begun = Compensation(settings(), QUILL)
+    begun.begin(recorded)
+    zero = begun.status.zero
+    assert zero is not None and zero.t_q_shift_k == last.t_q_shift_k
 
 
 def test_check_names_the_guards_and_a_head_that_cannot_be_written(

@@ -299,4 +299,4 @@ def _opening_zero(path: Path) -> Zero | None:
         state = decode_state(opening_of(path).get("state.json", b""))
     except DataError:
         return None
-    return Zero.of_references(state.engine.reference, state.zero, state.axes or {})
+    return Zero.of_references(state.engine, state.zero, state.axes or {})
