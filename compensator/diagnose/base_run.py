@@ -53,17 +53,19 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0, begins_min: float
     tdtf = model.tdtf.sampled if model.tdtf else SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=model.period_s)
     if model.late_t_q is None:
         drive, ambient_k = drive_of(model, run.difference_k), run.ambient_k
+        t_q_degc, at_degc = run.t_q_degc, run.at_degc
         y_dtf_um, y_tdtf_um = model.dtf.sampled.response(drive), tdtf.response(ambient_k)
     else:
-        t_q_degc, at_degc = run.reference
-        seen = observe(model, run.t_q_degc - t_q_degc, run.at_degc - at_degc)
+        t_q_ref, at_ref = run.reference
+        seen = observe(model, run.t_q_degc - t_q_ref, run.at_degc - at_ref)
+        t_q_degc, at_degc = seen.t_q_k + t_q_ref, seen.ambient_k + at_ref
         drive, ambient_k, y_dtf_um, y_tdtf_um = seen.drive, seen.ambient_k, seen.y_dtf_um, seen.y_tdtf_um
     return RecordSignals(
         period_min=model.period_s / 60.0,
         drive=drive,
         ambient_k=ambient_k,
-        t_q_degc=run.t_q_degc,
-        at_degc=run.at_degc,
+        t_q_degc=t_q_degc,
+        at_degc=at_degc,
         y_dtf_um=y_dtf_um,
         y_tdtf_um=y_tdtf_um,
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},

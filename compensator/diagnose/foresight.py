@@ -23,7 +23,7 @@ from compensator.model.effects import Effect
 from compensator.model.late_observer import observe, steady_variance_um2
 
 #: How many times the drive moves as it did in the calibration, and the lag that T_Q − AT of a direct model may be
-#: behind what moves so, min: where the search begins, and its bounds. Behind a lag, what moves so is larger by as much.
+#: behind what moves so, min: where the search begins, and its bounds.
 WALK_TIMES, WALK_BOUNDS = 1.0, (0.1, 10.0)
 BEHIND_MIN, BEHIND_BOUNDS_MIN = 8.0, (1.0, 60.0)
 #: Most trials of the search.
@@ -72,10 +72,7 @@ def _best(evidence: Evidence, late: Effect) -> Foresight:
 
     def foresight(x: Vector) -> Foresight:
         walk, *behind = np.exp(x).tolist()
-        if not is_direct:
-            return Foresight(walk_times=walk)
-        samples = behind[0] * 60.0 / evidence.model.period_s
-        return Foresight(walk_times=walk * (samples + 1.0), behind_min=behind[0])
+        return Foresight(walk_times=walk, behind_min=behind[0] if behind else 0.0)
 
     begin = np.log([WALK_TIMES, *([BEHIND_MIN] if is_direct else [])])
     bounds = np.log([WALK_BOUNDS, *([BEHIND_BOUNDS_MIN] if is_direct else [])])

@@ -580,7 +580,7 @@ class Engine:
         estimator = self.model.estimator
         feed = self.model.ttf.sampled.b[0] if self.model.ttf else 1.0
         at_walk = estimator.at_walk_std_k**2
-        t_q_walk = (feed * estimator.drive_walk_std) ** 2 + at_walk
+        t_q_walk = (feed * self.model.drive_walk_std) ** 2 + at_walk
         before = after if gap.held or gap.before is None else gap.before
         for i, sample in enumerate(gap.samples, start=1):
             t_q, t_q_missing = _interpolated(sample.t_q_k, before.t_q_k, after.t_q_k, i / n)

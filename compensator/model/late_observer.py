@@ -138,12 +138,15 @@ class Observed:
     ----------
     drive, ambient_k : numpy.ndarray, shape (n,)
         Heat, W (T_Q − AT, K, in a direct model), and change of the ambient, K.
+    t_q_k : numpy.ndarray, shape (n,)
+        T_Q without its dead time, as a change from its reference, K.
     y_dtf_um, y_tdtf_um : numpy.ndarray, shape (n,)
         Share of each path, µm.
     """
 
     drive: Vector
     ambient_k: Vector
+    t_q_k: Vector
     y_dtf_um: Vector
     y_tdtf_um: Vector
 
@@ -162,9 +165,9 @@ def observe(model: ThermalModel, t_q_k: Vector, at_k: Vector) -> Observed:
     rows = []
     for t_q, at in zip(t_q_k.tolist(), at_k.tolist(), strict=True):
         observer.step(t_q, at)
-        rows.append((observer.drive, observer.ambient_k, *observer.shares_um()))
-    drive, ambient_k, dtf, tdtf = np.array(rows).T
-    return Observed(drive=drive, ambient_k=ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf)
+        rows.append((observer.drive, observer.ambient_k, observer.t_q_k, *observer.shares_um()))
+    drive, ambient_k, t_q_k, dtf, tdtf = np.array(rows).T
+    return Observed(drive=drive, ambient_k=ambient_k, t_q_k=t_q_k, y_dtf_um=dtf, y_tdtf_um=tdtf)
 
 
 def late_variance_um2(model: ThermalModel) -> float:

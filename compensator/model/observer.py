@@ -90,13 +90,13 @@ class Observer:
     def __init__(self, model: ThermalModel) -> None:
         ttf = model.ttf.sampled if model.ttf else _UNITY
         ambient = _UNITY
-        late, walk_std = model.late_t_q, model.estimator.drive_walk_std
+        late, walk_std = model.late_t_q, model.drive_walk_std
         self._behind: SampledTransferFunction | None = None
         if late is not None:
             lag = late.within_a_sample(model.period_s, invertible=model.estimator.method == "inverse")
             ttf = ttf.times(lag)
             ambient = lag if late.of_ambient else _UNITY
-            self._behind, walk_std = late.behind(model.period_s), walk_std * late.walk_times
+            self._behind = late.behind(model.period_s)
         tdtf = model.tdtf.sampled if model.tdtf else _ZERO
         estimator = model.estimator
         further = [
@@ -107,6 +107,8 @@ class Observer:
         dtf = model.dtf.sampled
         if self._behind is not None:
             # What walks is before the drive: it leads to T_Q, to every DTF, and to the drive itself, which comes last.
+            # The lag lets so much of a change through in its first sample.
+            walk_std /= self._behind.b[0]
             ttf, dtf, nothing = self._behind.times(ttf), self._behind.times(dtf), _ZERO
             further = [self._behind.times(f) if i % 2 == 0 else f for i, f in enumerate(further)]
             further += [self._behind, nothing]

@@ -215,6 +215,12 @@ class ThermalModel(Shown):
         """By how much T_Q is late, where an effect says so."""
         return next((effect.lateness for effect in self.effects if effect.lateness is not None), None)
 
+    @property
+    def drive_walk_std(self) -> float:
+        """Standard deviation of the drive's change over a sample, in its unit: the estimator's, or a late T_Q's."""
+        late = self.late_t_q
+        return self.estimator.drive_walk_std * (1.0 if late is None else late.walk_times)
+
     def with_prompt_t_q(self) -> ThermalModel:
         """Return the model without the effect of a late T_Q."""
         return dataclasses.replace(self, effects=tuple(effect for effect in self.effects if effect.lateness is None))

@@ -16,8 +16,10 @@ from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
 from compensator.identify.calibration import predict
+from compensator.model.effects.base import effect_from, filters
 from compensator.model.effects.delay import DelayedSensor
 from compensator.model.effects.hypothesis import proposals
+from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
@@ -168,6 +170,23 @@ def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
     np.testing.assert_array_equal(own.share("all"), predict(found.model, runs[0]))
     again = diagnose(found.model, runs)
     assert [e.place for e in again.effects] == []
+
+
+def test_what_flows_beside_a_late_t_q_gets_the_engines_temperatures() -> None:
+    late = DelayedSensor(path="TTF", form="sensor", delay_min=8.0, lag_min=0.0)
+    table = {"form": "flow", "channel": "flow_lpm", "fluid": "coolant_degc", "span": 10.0, "half": 0.5}
+    flow = effect_from("input", table | {"tau_min": [20.0], "gain": [0.5], "gain_air": [0.2]})
+    model = dataclasses.replace(QUILL, effects=(late, flow))
+    columns, _, _ = record([sensor(0.0, 8.0)], 1103, 24.0)
+    minutes = np.arange(columns["y_um"].size)
+    channels = {"flow_lpm": 10.0 * (minutes % 90 > 30), "coolant_degc": 22.0 + 0.0 * minutes}
+    [run] = runs_from({name: columns[name] for name in ("t_q_degc", "at_degc", "y_um")} | channels)
+    engine = Engine(model)
+    engine.set_reference(*run.reference)
+    streamed = [e.y_effects_um[1] for e in engine.run(run.t_q_degc, run.at_degc, run.channels)]
+    at_once = flow.law(signals_of(model, run), filters(flow.blocks(1.0)))
+    assert np.ptp(streamed) > 2.0
+    np.testing.assert_allclose(streamed, at_once, rtol=0, atol=1e-9)
 
 
 def test_a_late_thermocouple_of_another_hand() -> None:

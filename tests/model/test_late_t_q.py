@@ -155,7 +155,7 @@ def test_a_drive_that_goes_on_is_foreseen() -> None:
     y = base.dtf.sampled.response(difference) + QUILL.tdtf.sampled.response(ambient)
     t_q, at, _ = run_of(3, 24.0, 0.005, form="sensor", lag_min=0.0, delay_min=8.0)
     stays = late(base, path="DTF", lag_min=0.0, delay_min=8.0)
-    goes_on = behind(20.0, 20.0, lag_min=0.0, delay_min=8.0)
+    goes_on = behind(20.0, 20.0 / 21.0, lag_min=0.0, delay_min=8.0)
     held, foreseen = (rms(predicted(m, t_q, at)[0] - y) for m in (stays, goes_on))
     t_q, at, _ = run_of(3, 24.0, 0.005, form="sensor", lag_min=0.0, delay_min=0.0)
     prompt = rms(predicted(base, t_q, at)[0] - y)
@@ -164,7 +164,7 @@ def test_a_drive_that_goes_on_is_foreseen() -> None:
 
 def test_a_drive_behind_what_moves_is_one_behind_a_ttf() -> None:
     """The direct model has the deformation of a model with that lag as its TTF; its drive stays T_Q − AT, K."""
-    model = behind(9.0, 3.0, delay_min=2.5, lag_min=3.0)
+    model = behind(9.0, 0.3, delay_min=2.5, lag_min=3.0)
     lag = SampledTransferFunction(b=(0.1,), a=(1.0, -0.9), period_s=60.0)
     estimator = dataclasses.replace(model.estimator, drive_walk_std=3.0 * model.estimator.drive_walk_std)
     ttf, dtf = Path(sampled=lag, unit="K/W"), Path(sampled=lag.times(model.dtf.sampled), unit="um/W")
@@ -182,6 +182,15 @@ def test_a_drive_behind_what_moves_is_one_behind_a_ttf() -> None:
     again = observer_of(model)
     again.restore(past.snapshot())
     assert (again.drive, again.shares_um(), again.drive_std) == (past.drive, past.shares_um(), past.drive_std)
+
+
+def test_how_fast_the_drive_moves_counts_in_a_gap_too() -> None:
+    t_q, at, _ = run_of(4, 12.0, 0.02, form="sensor", lag_min=3.0, delay_min=2.5)
+    t_q[300:330] = np.nan
+    by_effect = late(QUILL, lag_min=3.0, delay_min=2.5, walk_times=4.0)
+    estimator = dataclasses.replace(QUILL.estimator, drive_walk_std=4.0 * QUILL.estimator.drive_walk_std)
+    by_estimator = late(dataclasses.replace(QUILL, estimator=estimator), lag_min=3.0, delay_min=2.5)
+    np.testing.assert_array_equal(predicted(by_effect, t_q, at), predicted(by_estimator, t_q, at))
 
 
 @pytest.mark.parametrize("method", ["kalman", "inverse"])

@@ -58,7 +58,7 @@ class DelayedSensor(DelayedPath):
     form: str = text("sensor", "path")
     delay_min: float = number(0.0, 240.0)
     lag_min: float = number(0.0, 240.0)
-    walk_times: float = optional_number(1e-3, 1e3, default=1.0)
+    walk_times: float = optional_number(1e-2, 1e2, default=1.0)
     behind_min: float = optional_number(0.0, 240.0, default=0.0)
 
     def check_base(self, kind: str) -> None:

@@ -24,7 +24,8 @@ class Signals(Generic[S]):
     ambient_k : float
         AT as a change from the reference, K.
     t_q_degc, at_degc : float
-        T_Q and AT as they are, °C, for what exchanges heat with something whose temperature is measured, too.
+        T_Q and AT as they are, °C, for what exchanges heat with something whose temperature is measured, too. Where
+        the model corrects a dead time of T_Q, what its sensor is going to show after it.
     y_dtf_um, y_tdtf_um : float
         Share of each path, µm.
     channels : mapping of str to float
