@@ -20,6 +20,8 @@ from compensator.errors import DataError
 OUTLIER_DEVIATIONS = 12.0
 #: So many outliers may follow each other where a signal is slow: what disturbs one reading may reach into the next.
 IN_A_ROW = 2
+#: In so many readings that happens once at most; what is seen more often is the signal.
+RARE_SAMPLES = 1000
 #: What is beside an outlier is together within this share of its distance.
 TOGETHER = 0.3
 #: At an end of a record so many samples beside a reading have to be together.
@@ -150,7 +152,7 @@ def without_outliers(
     noise = noise_std(v)
     # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
     limit = OUTLIER_DEVIATIONS * noise + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
-    outliers = known[np.concatenate([_apart(v, count, limit) for count in range(1, in_a_row + 1)])]
+    outliers = np.unique(np.concatenate([_apart(v, known, count, limit) for count in range(1, in_a_row + 1)]))
     if noise > 0.0:  # what was computed has no wrong readings, but may begin with a step
         known = np.setdiff1d(known, outliers)
         ends = [end for end, asked in ((_first_alone, first), (_last_alone, last)) if asked]
@@ -162,15 +164,24 @@ def without_outliers(
     return kept, int(outliers.size)
 
 
-def _apart(v: Vector, count: int, limit: float) -> Indices:
-    """Return where so many readings in a row are far from both that are beside them, and on one side of these."""
+def _apart(v: Vector, known: Indices, count: int, limit: float) -> Indices:
+    """Return where so many readings in a row are far from both that are beside them, and on one side of these.
+
+    Several in a row may also be what a signal does, as where a quick heat is on for a minute or two: then it does so
+    again.
+    """
     rows = sliding_window_view(v, count)[1:-1]
     before, after = v[: -count - 1], v[count + 1 :]
     above = np.min(rows, axis=1) - np.maximum(before, after)
     below = np.minimum(before, after) - np.max(rows, axis=1)
     distance = np.maximum(above, below)
     apart = (distance > limit) & (np.abs(after - before) < TOGETHER * distance)
-    return (np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()
+    if count > 1:
+        # Behind a gap a signal may be anywhere.
+        apart &= known[count + 1 :] - known[: -count - 1] <= count + SHORT_GAP_SAMPLES
+        if np.count_nonzero(apart) > max(1, v.size // RARE_SAMPLES):
+            return np.zeros(0, dtype=int)
+    return np.asarray(known[(np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()])
 
 
 def _first_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:

@@ -124,9 +124,8 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Con
     """Return what proposals may build on: paths, gains, and channels that move, but for those that are no causes."""
     common = [name for name in signals[0].channels if all(name in record.channels for record in signals)]
     spans, zeroed = {}, set()
-    for name in common:
-        if name in apart or name.endswith(DISPLACEMENT):
-            continue
+    usable = [name for name in common if name not in apart and not name.endswith(DISPLACEMENT)]
+    for name in usable:
         values = np.concatenate([record.channels[name] for record in signals])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
             spans[name] = float(np.ptp(values))
@@ -146,6 +145,7 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Con
         sizes_um=sizes,
         taus_min={name: tuple(t for t in path.time_constants_min() if t > 0.0) for name, path in paths.items()},
         spans=spans,
+        temperatures=tuple(name for name in usable if name.endswith(DEGC)),
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,
         has_late_t_q=model.late_t_q is not None,

@@ -102,7 +102,8 @@ def diagnose(
     held_out = held_out_of(found, places, progress, executor_map)
     found, effects, held_out = _worth_deploying(found, effects, held_out)
     found, effects, held_out = _by_channels(found, effects, held_out)
-    if evidence.free_paths and unseen and _foretells_better(found, held_out):
+    # A base that was calibrated on other data may foretell held-out blocks better as it is.
+    if evidence.free_paths and unseen and rms_of(held_out.base) < rms_of(held_out.whole):
         return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
     few = evidence.is_sparse
     reverses = any(effect.reverses_path for effect in effects)
@@ -232,14 +233,6 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     is_late = found.explains and late_term(found.selection.fit) is not None
     is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else CONTRADICTS) * base_um
     return (base_um, own_um) if is_worse else None
-
-
-def _foretells_better(found: Findings, held_out: HeldOut) -> bool:
-    """Return whether the base as it is foretells data that it has not seen better than paths that are fitted anew.
-
-    Both errors are of data that took no part: those of held-out blocks, and the base's own in free run.
-    """
-    return in_free_run(found)[0] < rms_of(held_out.whole)
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:

@@ -194,7 +194,19 @@ def in_free_run(found: Findings) -> tuple[float, float]:
     the measurement and counts neither way.
     """
     evidence = found.search.evidence
-    hidden, of_time, base = (np.zeros(evidence.used.size) for _ in range(3))
+    hidden, of_time = not_deployed(found)
+    at_rest = all(signals.initial_um is None for signals in evidence.signals)
+
+    def left_um(added: Vector) -> float:
+        left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]
+        return float(np.sqrt(np.mean(left**2)))
+
+    return left_um(by_base(evidence)), left_um(found.whole - hidden - of_time)
+
+
+def not_deployed(found: Findings) -> tuple[Vector, Vector]:
+    """Return what no channel shows, and what depends on time alone, of the named effects, µm."""
+    hidden, of_time = (np.zeros(found.search.evidence.used.size) for _ in range(2))
     # A remainder in the place of effects is for all of it.
     effects = zip(found.terms, found.responses, strict=True) if found.explains else ()
     for term, added in effects:
@@ -202,15 +214,14 @@ def in_free_run(found: Findings) -> tuple[float, float]:
             hidden += added
         elif not term.effect.deployable:
             of_time += added
-    if evidence.free_paths:  # the residual is all of y
-        base = np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
-    at_rest = all(signals.initial_um is None for signals in evidence.signals)
+    return hidden, of_time
 
-    def left_um(added: Vector) -> float:
-        left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]
-        return float(np.sqrt(np.mean(left**2)))
 
-    return left_um(base), left_um(found.whole - hidden - of_time)
+def by_base(evidence: Evidence) -> Vector:
+    """Return what the base's paths as they are make of the residual, µm: all of y where they are free, else nothing."""
+    if not evidence.free_paths:
+        return np.zeros(evidence.used.size)
+    return np.concatenate([signals.y_dtf_um + signals.y_tdtf_um for signals in evidence.signals])
 
 
 def _has_own_error(fit: Fit) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from compensator.arrays import Indices, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
 from compensator.diagnose.scan import Grid
@@ -36,8 +36,12 @@ WITH_PATHS = "; before: the paths of the first model alone, also refitted to the
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOut:
-    """What is left on every sample by estimates that did not see it, µm; NaN where y is missing."""
+    """What is left on every sample by estimates that did not see it, µm; NaN where y is missing.
 
+    `base` is left by the base's paths as they are, of which the other blocks set the zero and initial state only.
+    """
+
+    base: Vector
     nothing: Vector
     named: Vector
     whole: Vector
@@ -58,17 +62,19 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     predicted = executor_map(
         partial(_predictions, places=places, unobserved=unobserved, grid=grid, foresight=found.foresight), views
     )
-    left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
+    base = by_base(evidence) + not_deployed(found)[1]
+    left = np.full((2, 5 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
         progress(done, len(blocks) + 1)
         searches += several.has
         for choice in (0, 1):
-            for i, one in enumerate(several.added):
+            for i, one in enumerate((base, *several.added)):
                 left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
-    best = min((0, 1), key=lambda choice: rms_of(left[choice, 0]))
-    nothing, named, whole, ceiling, *steps = left[best]
+    best = min((0, 1), key=lambda choice: rms_of(left[choice, 1]))
+    base, nothing, named, whole, ceiling, *steps = left[best]
     return HeldOut(
+        base=base,
         nothing=nothing,
         named=named,
         whole=whole,

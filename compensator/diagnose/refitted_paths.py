@@ -73,7 +73,8 @@ def with_fewer_lags(gains: Vector, taus_min: Sequence[float], period_min: float,
     for size in range(1, min(PATH_LAGS, len(lagged)) + 1):
         for some in itertools.combinations(lagged, size):
             which = (*direct, *some)
-            fewer = np.linalg.solve(square[np.ix_(which, which)], products[list(which)])
+            # Lags well below a sample are all the same; solve() would refuse two of them.
+            fewer = np.linalg.lstsq(square[np.ix_(which, which)], products[list(which)], rcond=None)[0]
             left = float(np.linalg.norm(wanted - table[:, which] @ fewer))
             kept = min(kept, (left, which, fewer), key=lambda each: each[0])
         if kept[0] <= PATH_EXACT * float(np.linalg.norm(wanted)):

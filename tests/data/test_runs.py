@@ -134,6 +134,24 @@ def test_two_wild_readings_in_a_row_go_where_a_signal_is_slow():
     assert "t_q_degc: 2 outlier(s)" in remark
 
 
+def test_what_happens_again_and_again_in_two_readings_is_the_signal():
+    """A quick couple beside a heat that is on for two minutes, 44 times in 5 days; and two readings between gaps."""
+    values = 20.0 + np.random.default_rng(5).normal(0.0, 0.02, 7200)
+    for first in range(100, 7200, 165):
+        values[first : first + 2] += [6.0, 9.0]
+    assert without_outliers(values, in_a_row=2)[1] == 0
+    apart = 20.0 + np.random.default_rng(6).normal(0.0, 0.02, 600)
+    apart[200:300] = apart[302:400] = np.nan
+    apart[300:302] = 25.0
+    assert without_outliers(apart, in_a_row=2)[1] == 0
+
+
+def test_every_reading_that_is_left_out_counts_once():
+    values = np.zeros(1000)
+    values[500:502] = [50.0, 1000.0]
+    assert without_outliers(values, in_a_row=2)[1] == 2
+
+
 def test_a_signal_full_of_spikes_is_a_signal():
     values = np.random.default_rng(3).normal(0.0, 0.01, 400)
     values[10::15] += 5.0

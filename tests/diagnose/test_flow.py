@@ -5,6 +5,7 @@ import pytest
 
 from compensator.diagnose.diagnosis import diagnose
 from compensator.identify.calibration import predict
+from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import Scenario, lag, record
 from tests.identify.quill_runs import runs_from
@@ -46,3 +47,25 @@ def test_the_extended_model_predicts_a_day_with_other_flows(found):
     (run,) = runs_from(columns)
     errors = [np.std(true - predict(model, run)) for model in (QUILL, found.model)]
     assert errors[0] > 2.0 and errors[1] < 0.15 * errors[0]
+
+
+def test_a_fluid_whose_temperature_does_not_move_is_one():
+    """A large tank stays at 22 °C; what it takes from the machine goes by the pump and by T_Q."""
+
+    def act(signals):
+        still = signals[1] | {"coolant_degc": np.full(signals[0], 22.0)}
+        return wetted((signals[0], still, *signals[2:]))
+
+    columns, _, _ = record([Scenario(place=("input", "", "fan_rpm"), act=act)], 1402)
+    rng = np.random.default_rng(1402)
+    columns["coolant_degc"] = 22.0 + rng.normal(0.0, 0.02, columns["y_um"].size)
+    [effect] = diagnose(QUILL, runs_from(columns)).effects
+    assert effect.effect.channels == ("fan_rpm", "coolant_degc")
+    assert effect.rms_after_um < 0.35
+
+
+@pytest.mark.parametrize(("channel", "name"), [("a_rpm", "_rpm"), ("a_l_per_min", "_l_per_min"), ("coolant_flow", "")])
+def test_the_flow_for_half_is_named_with_the_unit_of_the_flow(channel, name):
+    table = {"form": "flow", "channel": channel, "fluid": "b_degc", "span": 8.0, "half": 0.25}
+    effect = effect_from("input", table | {"tau_min": [20.0], "gain": [0.5], "gain_air": [0.2]})
+    assert effect.named({})[f"half_flow{name}"] == 2.0

@@ -125,7 +125,9 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it(
     called_late: Findings, channels_um: float, is_confirmed: bool
 ) -> None:
     ones = np.ones(called_late.ceiling.size)
-    held_out = HeldOut(nothing=ones, named=2.0 * ones, whole=2.0 * ones, ceiling=channels_um * ones, steps=())
+    held_out = HeldOut(
+        base=ones, nothing=ones, named=2.0 * ones, whole=2.0 * ones, ceiling=channels_um * ones, steps=()
+    )
     found, _, judged = _by_channels(called_late, (), held_out)
     assert found.explains is not is_confirmed
     assert judged.whole[0] == (channels_um if is_confirmed else 2.0)

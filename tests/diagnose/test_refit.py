@@ -10,10 +10,11 @@ from scipy.signal import lfilter
 from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
-from compensator.diagnose.background import Background
+from compensator.diagnose.background import LAGS_MIN, Background
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
+from compensator.diagnose.findings import findings_of, in_free_run
+from compensator.diagnose.outcome import rms_of
 from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
@@ -140,7 +141,7 @@ def test_paths_that_held_out_blocks_contradict_are_not_deployed(
     assert (again.dtf == model.dtf and again.effects == ()) is not deployed
 
 
-def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, found, searches, monkeypatch):
+def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, searches, monkeypatch):
     """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
     real, asked = diagnosis_module.findings_of, []
 
@@ -149,15 +150,16 @@ def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, 
         return searches["findings_of"][0] if evidence.free_paths else real(evidence)
 
     monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
-    held_out_of = diagnosis_module.held_out_of
-    monkeypatch.setattr(
-        diagnosis_module,
-        "held_out_of",
-        lambda found, *more: searches["held_out_of"][0] if asked == [True] else held_out_of(found, *more),
-    )
-    shown_um = found.after.rms_um
-    for base_um, kept in ((0.9 * shown_um, True), (1.1 * shown_um, False)):
-        monkeypatch.setattr(diagnosis_module, "in_free_run", lambda _, base_um=base_um: (base_um, base_um))
+    real_held_out, anew = diagnosis_module.held_out_of, searches["held_out_of"][0]
+    # Its zero is from the other blocks, as that of the new paths: a little more is left than with its own.
+    assert rms_of(anew.base) > in_free_run(searches["findings_of"][0])[0]
+    for factor, kept in ((0.9, True), (1.1, False)):
+        base = dataclasses.replace(anew, base=factor * anew.whole)
+
+        def held_out_of(found, *more, base=base):
+            return base if asked == [True] else real_held_out(found, *more)
+
+        monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
         asked.clear()
         again = diagnose(model, runs, unseen=True)
         assert (again.model.dtf == model.dtf) is kept
@@ -256,6 +258,15 @@ def test_a_path_of_few_lags_is_that_of_all_where_the_record_moves_fast():
     model, _ = with_paths(load_model("quill"), with_few_lags(gains))
     wanted = FilterBank(TAUS_MIN, [gains], 1.0, lag_or_none).filter(drive - drive[0])
     assert np.std(model.dtf.sampled.response(drive - drive[0]) - wanted) < 0.1 * np.std(wanted)
+
+
+@pytest.mark.parametrize("period_min", [24.0, 30.0])
+def test_lags_that_a_long_sample_does_not_tell_apart_are_no_error(period_min):
+    drive = np.random.default_rng(2).normal(0.0, 1.0, 1500).cumsum()
+    bank = np.column_stack([lag_or_none(tau, period_min).filter(drive - drive[0]) for tau in LAGS_MIN])
+    gains = np.random.default_rng(3).normal(0.0, 1.0, len(LAGS_MIN))
+    kept = with_fewer_lags(gains, LAGS_MIN, period_min, bank)
+    assert np.std(bank @ (gains - kept)) < 0.1 * np.std(bank @ gains)
 
 
 def test_paths_fitted_anew_keep_the_observer_sane():

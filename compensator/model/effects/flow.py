@@ -15,9 +15,9 @@ from typing import Any
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, S
-from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min, unit_of
-from compensator.model.effects.seen import Seen, digits, quantity
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
+from compensator.model.effects.seen import Seen, digits, quantity, unit_in, unit_of_channel
 from compensator.model.effects.signals import Signals
 
 
@@ -53,7 +53,8 @@ class Flow(BankEffect, Effect):
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest by the fluid's temperature at the largest flow, the time to half of it, and h."""
         found = {"gain_um_per_k": math.fsum(self._gains), "half_time_min": self.half_time_min()}
-        return found | {f"half_flow_{unit_of(self.channel)}": self.half * self.span}
+        unit = f"_{unit_in(self.channel)}" if unit_of_channel(self.channel) else ""
+        return found | {f"half_flow{unit}": self.half * self.span}
 
     @property
     def _gains(self) -> tuple[float, ...]:
@@ -87,9 +88,7 @@ def flows(context: Context) -> Iterator[Hypothesis]:
     half = Free(name="half", low=0.01, high=100.0, grid=(0.03, 0.3, 3.0))
     one, several = context.tau(), context.bank_min
     for channel in sorted(context.zeroed):
-        for fluid in context.channels:
-            if not fluid.endswith(DEGC):
-                continue
+        for fluid in context.temperatures:
             place: dict[str, Any] = {"channel": channel, "fluid": fluid, "span": context.spans[channel], "half": 1.0}
             form = f"flow of {fluid}"
             if context.approximate:

@@ -157,6 +157,8 @@ class Context:
         Time constants of each path, min.
     spans : mapping of str to float
         Span of each channel that moves, in its unit.
+    temperatures : tuple of str
+        Channels in °C, whether they move or not: a tank of coolant stays as it is.
     zeroed : frozenset of str
         Channels with a zero of their own: they come near 0 and go far from it. No temperature in °C is one.
     functions : mapping of str to (tuple of float, tuple of float)
@@ -180,6 +182,7 @@ class Context:
     sizes_um: Mapping[str, float]
     taus_min: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     spans: Mapping[str, float] = field(default_factory=dict)
+    temperatures: tuple[str, ...] = ()
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
     gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)

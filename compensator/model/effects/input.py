@@ -19,7 +19,7 @@ from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import Seen, digits, quantity, signed
+from compensator.model.effects.seen import Seen, digits, quantity, signed, unit_in
 from compensator.model.effects.signals import Signals
 
 #: Curves by name: of one sample, or of a record.
@@ -157,5 +157,5 @@ def half_time_min(taus_min: Sequence[float], gains: Sequence[float], delay_min: 
 
 def unit_of(channel: str) -> str:
     """Return the unit that a channel's name carries; a temperature's gain is per kelvin."""
-    unit = channel.rsplit("_", 1)[-1] if "_" in channel else "unit"
+    unit = unit_in(channel) or "unit"
     return {"degc": "k"}.get(unit, unit)

@@ -184,4 +184,18 @@ def quantity(value: float, channel: str) -> str:
 
 def unit_of_channel(channel: str) -> str:
     """Return the unit that a channel's name carries, as people write it; empty where it carries none."""
-    return _UNITS.get(channel.rpartition("_")[2], "") if "_" in channel else ""
+    over, per, under = unit_in(channel).partition("_per_")
+    return f"{_UNITS.get(over, over)}/{_UNITS.get(under, under)}" if per else _UNITS.get(over, "")
+
+
+def unit_in(channel: str) -> str:
+    """Return the end of a channel's name that is its unit, as in names of parameters; empty if it has one word.
+
+    Examples
+    --------
+    >>> unit_in("spindle_rpm"), unit_in("coolant_l_per_min"), unit_in("door"), unit_of_channel("coolant_l_per_min")
+    ('rpm', 'l_per_min', '', 'l/min')
+    """
+    words, per, under = channel.partition("_per_")
+    before, _, unit = words.rpartition("_")
+    return f"{unit}{per}{under}" if before else ""
