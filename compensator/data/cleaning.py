@@ -20,8 +20,6 @@ from compensator.errors import DataError
 OUTLIER_DEVIATIONS = 12.0
 #: So many outliers may follow each other where a signal is slow: what disturbs one reading may reach into the next.
 IN_A_ROW = 2
-#: In so many readings that happens once at most; what is seen more often is the signal.
-RARE_SAMPLES = 1000
 #: What is beside an outlier is together within this share of its distance.
 TOGETHER = 0.3
 #: At an end of a record so many samples beside a reading have to be together.
@@ -167,8 +165,8 @@ def without_outliers(
 def _apart(v: Vector, known: Indices, count: int, limit: float) -> Indices:
     """Return where so many readings in a row are far from both that are beside them, and on one side of these.
 
-    Several in a row may also be what a signal does, as where a quick heat is on for a minute or two: then it does so
-    again.
+    Several in a row may also be what a signal does, as where a quick couple is heated for a minute or two: then it is
+    seen in what is beside them, too, and of a disturbance nothing is.
     """
     rows = sliding_window_view(v, count)[1:-1]
     before, after = v[: -count - 1], v[count + 1 :]
@@ -179,8 +177,11 @@ def _apart(v: Vector, known: Indices, count: int, limit: float) -> Indices:
     if count > 1:
         # Behind a gap a signal may be anywhere.
         apart &= known[count + 1 :] - known[: -count - 1] <= count + SHORT_GAP_SAMPLES
-        if np.count_nonzero(apart) > max(1, v.size // RARE_SAMPLES):
-            return np.zeros(0, dtype=int)
+        beside = np.concatenate(
+            [sliding_window_view(v, 2)[: -count - 2], sliding_window_view(v, 2)[count + 2 :]], axis=1
+        )
+        apart[0] = apart[-1] = False
+        apart[1:-1] &= np.ptp(beside, axis=1) < limit
     return np.asarray(known[(np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()])
 
 

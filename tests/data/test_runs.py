@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from compensator.data.cleaning import cleaned, without_outliers
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
@@ -134,12 +135,18 @@ def test_two_wild_readings_in_a_row_go_where_a_signal_is_slow():
     assert "t_q_degc: 2 outlier(s)" in remark
 
 
-def test_what_happens_again_and_again_in_two_readings_is_the_signal():
-    """A quick couple beside a heat that is on for two minutes, 44 times in 5 days; and two readings between gaps."""
-    values = 20.0 + np.random.default_rng(5).normal(0.0, 0.02, 7200)
-    for first in range(100, 7200, 165):
-        values[first : first + 2] += [6.0, 9.0]
-    assert without_outliers(values, in_a_row=2)[1] == 0
+@pytest.mark.parametrize("tau_min", [1.0, 2.5])
+def test_a_couple_that_is_heated_for_two_minutes_is_no_disturbance(tau_min):
+    heat = np.zeros(4 * 7200)  # four readings a minute, whose means are the record
+    for first in range(400, heat.size, 661):
+        heat[first : first + 8] = 15.0
+    keep = np.exp(-0.25 / tau_min)
+    means = lfilter([1.0 - keep], [1.0, -keep], heat).reshape(-1, 4).mean(axis=1)
+    values = 20.0 + means + np.random.default_rng(5).normal(0.0, 0.02, 7200)
+    assert without_outliers(values, in_a_row=2)[1] == without_outliers(values)[1]
+
+
+def test_two_readings_between_gaps_are_no_disturbance():
     apart = 20.0 + np.random.default_rng(6).normal(0.0, 0.02, 600)
     apart[200:300] = apart[302:400] = np.nan
     apart[300:302] = 25.0
