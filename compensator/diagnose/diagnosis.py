@@ -19,10 +19,11 @@ from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
+from compensator.diagnose.deployment import deployment_of
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
-from compensator.diagnose.fit import Term, fit_terms, late_term
+from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
@@ -42,14 +43,6 @@ from compensator.progress import ExecutorMap, Progress, unreported
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
-#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor, or the data that were
-#: searched are in free run. Where the base's paths are fitted anew each block knows less of them than the whole.
-CONTRADICTS, CONTRADICTS_ANEW = 1.25, 2.5
-#: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
-LOWERS = 0.97
-#: Beside a late T_Q it is for the minutes that a dead time hides: they are most of what is left, or something else is
-#: (set on 8 drawn machines, where less than this made the fresh run no better, and on 2 of another simulator).
-LOWERS_LATE = 0.75
 
 
 def diagnose(
@@ -100,22 +93,16 @@ def diagnose(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = held_out_of(found, places, progress, executor_map)
-    found, effects, held_out = _worth_deploying(found, effects, held_out)
-    found, effects, held_out = _by_channels(found, effects, held_out)
-    # A base that was calibrated on other data may foretell held-out blocks better as it is.
-    if evidence.free_paths and unseen and rms_of(held_out.base) < rms_of(held_out.whole):
+    chosen = deployment_of(found, effects, held_out)
+    found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
+    if unseen and chosen.base_foretells_better:
         return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
     few = evidence.is_sparse
-    reverses = any(effect.reverses_path for effect in effects)
-    worse_um = _worse_in_free_run(found)
-    refused = _contradicted(found, held_out) or reverses or worse_um is not None
-    if refused:
-        effects = _not_replaced(effects)
-    extended, remarks = (model, ()) if refused else _extended(model, found, effects)
+    extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
     ceiling = _ceiling(held_out)
-    verdict, is_explained = _verdict(found, effects, held_out, extended, holds_in_free_run=worse_um is None)
+    verdict, is_explained = _verdict(found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None)
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
@@ -135,11 +122,11 @@ def diagnose(
         held_out.whole,
         deployed=deployed,
         few=few,
-        worse_um=worse_um,
+        worse_um=chosen.worse_um,
         start_k=evidence.start_k,
     )
     return Diagnosis(
-        verdict="unexplained" if hides or reverses else verdict,
+        verdict="unexplained" if hides or chosen.reverses_path else verdict,
         effects=effects,
         held_out=how_held_out(evidence),
         model=extended,
@@ -170,69 +157,6 @@ def _as_begun(found: Findings) -> Findings:
         return found
     again = findings_of(evidence)
     return again if score(again.selection.fit) > score(fit) else found
-
-
-def _worth_deploying(
-    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
-) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
-    """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
-    evidence = found.search.evidence
-    if not effects and not evidence.free_paths:
-        # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
-        whole = held_out.whole if found.remainder is not None else held_out.nothing
-        held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
-    if found.remainder is None or found.belongs:
-        return found, effects, held_out
-    whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
-    if evidence.is_sparse:
-        # Few values: chance lowers the error of no remainder by much.
-        helps = whole_um < LOWERS * min(named_um, nothing_um)
-    elif late_term(found.selection.fit):
-        helps = whole_um < LOWERS_LATE * named_um
-    else:
-        helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
-    if helps:
-        return found, effects, held_out
-    without = dataclasses.replace(held_out, whole=held_out.named)
-    return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
-
-
-def _by_channels(
-    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
-) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
-    """Deploy all channels in the place of names with which the engine is worse, where held-out data confirm them."""
-    instead = by_channels(found)
-    if instead is None or rms_of(held_out.ceiling) > min(map(rms_of, (held_out.whole, held_out.nothing))):
-        return found, effects, held_out
-    effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
-    return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
-
-
-def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
-    """Return effects in whose place no remainder is deployed."""
-    return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
-
-
-def _contradicted(found: Findings, held_out: HeldOut) -> bool:
-    """Return whether held-out blocks contradict what was found; few values do not decide that.
-
-    Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
-    """
-    evidence = found.search.evidence
-    factor = CONTRADICTS_ANEW if evidence.free_paths else CONTRADICTS
-    return not evidence.is_sparse and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
-
-
-def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
-    """Return what is left in free run without and with what would be deployed, µm rms, if that is clearly worse.
-
-    With a late T_Q, if it is worse at all: that acts at every change of the heat, so on this record as on others. Where
-    noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
-    """
-    base_um, own_um = in_free_run(found)
-    is_late = found.explains and late_term(found.selection.fit) is not None
-    is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else CONTRADICTS) * base_um
-    return (base_um, own_um) if is_worse else None
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:

@@ -12,7 +12,8 @@ import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import findings as module
-from compensator.diagnose.diagnosis import _by_channels, _evidence
+from compensator.diagnose.deployment import _by_channels
+from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
 from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.outcome import warnings_of

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from compensator.diagnose import deployment as deployment_module
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
@@ -202,7 +203,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
     # The same where its own data contradict what would be deployed, in free run.
     times = 0.1
-    monkeypatch.setattr(diagnosis_module, "in_free_run", lambda _: (1.0, 1.3))
+    monkeypatch.setattr(deployment_module, "in_free_run", lambda _: (1.0, 1.3))
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and tone_of(figures(bad)) == "warn"
     assert not bad.model.effects and "worse_in_free_run" in [warning.code for warning in bad.warnings]

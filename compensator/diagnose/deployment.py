@@ -1,0 +1,153 @@
+"""What of the findings is deployed: effects, a remainder beside them or in their place, or nothing.
+
+The rules stand in their order in `deployment_of`. Two errors decide: that on held-out blocks, and that in free run on
+the data that were searched.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from compensator.diagnose.findings import Findings, by_channels, in_free_run
+from compensator.diagnose.fit import late_term
+from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.held_out import HeldOut
+from compensator.diagnose.outcome import rms_of
+
+#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor, or the data that were
+#: searched are in free run. Where the base's paths are fitted anew each block knows less of them than the whole.
+CONTRADICTS, CONTRADICTS_ANEW = 1.25, 2.5
+#: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
+LOWERS = 0.97
+#: Beside a late T_Q it is for the minutes that a dead time hides: they are most of what is left, or something else is
+#: (set on 8 drawn machines, where less than this made the fresh run no better, and on 2 of another simulator).
+LOWERS_LATE = 0.75
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deployment:
+    """What would be deployed, and why it is not.
+
+    Parameters
+    ----------
+    found : Findings
+        Without a remainder that does not help, or with all channels in the place of names that do not.
+    effects : tuple of FoundEffect
+        Named effects, with whether a remainder takes their place.
+    held_out : HeldOut
+        Errors on held-out blocks; `whole` is that of what would be deployed.
+    contradicted : bool
+        Whether held-out blocks are predicted clearly worse with it.
+    worse_um : tuple of (float, float), optional
+        What is left in free run without and with it, µm rms, where that is worse.
+    """
+
+    found: Findings
+    effects: tuple[FoundEffect, ...]
+    held_out: HeldOut
+    contradicted: bool
+    worse_um: tuple[float, float] | None
+
+    @property
+    def reverses_path(self) -> bool:
+        """Whether an effect turns the sense of a path, which no machine does."""
+        return any(effect.reverses_path for effect in self.effects)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether nothing is deployed."""
+        return self.contradicted or self.reverses_path or self.worse_um is not None
+
+    @property
+    def base_foretells_better(self) -> bool:
+        """Whether held-out blocks are predicted better by the base's paths as they are than by those fitted anew."""
+        return self.found.search.evidence.free_paths and rms_of(self.held_out.base) < rms_of(self.held_out.whole)
+
+
+def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut) -> Deployment:
+    """Decide what of the findings is deployed.
+
+    Parameters
+    ----------
+    found : Findings
+        Effects and remainder.
+    effects : tuple of FoundEffect
+        The named effects.
+    held_out : HeldOut
+        Errors on held-out blocks.
+    """
+    found, effects, held_out = _with_remainder_that_helps(found, effects, held_out)
+    found, effects, held_out = _by_channels(found, effects, held_out)
+    decided = Deployment(
+        found=found,
+        effects=effects,
+        held_out=held_out,
+        contradicted=_is_contradicted(found, held_out),
+        worse_um=_worse_in_free_run(found),
+    )
+    return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
+
+
+def _with_remainder_that_helps(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
+) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+    """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
+    evidence = found.search.evidence
+    if not effects and not evidence.free_paths:
+        # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
+        whole = held_out.whole if found.remainder is not None else held_out.nothing
+        held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
+    if found.remainder is None or found.belongs:
+        return found, effects, held_out
+    whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
+    if evidence.is_sparse:
+        # Few values: chance lowers the error of no remainder by much.
+        helps = whole_um < LOWERS * min(named_um, nothing_um)
+    elif late_term(found.selection.fit):
+        helps = whole_um < LOWERS_LATE * named_um
+    else:
+        helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
+    if helps:
+        return found, effects, held_out
+    without = dataclasses.replace(held_out, whole=held_out.named)
+    return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
+
+
+def _by_channels(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
+) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+    """Deploy all channels in the place of names with which the engine is worse, where held-out data confirm them."""
+    instead = by_channels(found)
+    if instead is None or rms_of(held_out.ceiling) > min(map(rms_of, (held_out.whole, held_out.nothing))):
+        return found, effects, held_out
+    effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
+    return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
+
+
+def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
+    """Return effects in whose place no remainder is deployed."""
+    return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
+
+
+def _is_contradicted(found: Findings, held_out: HeldOut) -> bool:
+    """Return whether held-out blocks contradict what was found; few values do not decide that.
+
+    Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
+    """
+    evidence = found.search.evidence
+    factor = CONTRADICTS_ANEW if evidence.free_paths else CONTRADICTS
+    return not evidence.is_sparse and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
+
+
+def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
+    """Return what is left in free run without and with what would be deployed, µm rms, if that is clearly worse.
+
+    With a late T_Q, if it is worse at all: that acts at every change of the heat, so on this record as on others. Where
+    noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
+    """
+    base_um, own_um = in_free_run(found)
+    is_late = found.explains and late_term(found.selection.fit) is not None
+    is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else CONTRADICTS) * base_um
+    return (base_um, own_um) if is_worse else None
