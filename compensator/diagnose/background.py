@@ -61,6 +61,11 @@ class Regressed:
     log_evidence: float
     rest: Rest
 
+    def times(self, share: float) -> Regressed:
+        """Return a share of the response; what is open of it stays as it is."""
+        gains = tuple(tuple(share * gain for gain in row) for row in self.effect.gains)
+        return dataclasses.replace(self, effect=dataclasses.replace(self.effect, gains=gains), added=share * self.added)
+
 
 class Background:
     """All channels through filter banks.

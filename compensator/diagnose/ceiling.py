@@ -135,13 +135,19 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     return [Words(title="Remainder", lines=lines)]
 
 
+def _part(rest: Mapping[str, Any]) -> str:
+    """Return how much of an own error is deployed, in words; empty of all of it, and in a file that does not say."""
+    share = float(rest.get("confirmed", 1.0))
+    return "" if share > 0.99 else f"{100.0 * share:.0f} % of "
+
+
 def _why_deployed(rest: Mapping[str, Any]) -> str:
     """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
     deployed = "Deployed in the extended model"
     if rest.get("belongs"):
         return (
-            f"{deployed} with the named effects: it is the base model's own error that they were fitted beside, and "
-            "they hold only with it. Held-out data do not decide it."
+            f"{deployed} with the named effects: it is {_part(rest)}the base model's own error that they were fitted "
+            "beside, as much of it as predicts held-out data best."
         )
     if rest.get("instead"):
         why = "which leave more on held-out data" if _lowers(rest) else "because all data are more probable with it"

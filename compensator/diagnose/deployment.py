@@ -10,6 +10,8 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from compensator.diagnose.findings import Findings, by_channels, in_free_run
 from compensator.diagnose.fit import late_term
 from compensator.diagnose.found_effect import FoundEffect
@@ -99,6 +101,8 @@ def _with_remainder_that_helps(
         # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
         whole = held_out.whole if found.remainder is not None else held_out.nothing
         held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
+    if found.belongs and not evidence.free_paths:
+        return _as_far_as_confirmed(found, effects, held_out)
     if found.remainder is None or found.belongs:
         return found, effects, held_out
     whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
@@ -113,6 +117,26 @@ def _with_remainder_that_helps(
         return found, effects, held_out
     without = dataclasses.replace(held_out, whole=held_out.named)
     return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
+
+
+def _as_far_as_confirmed(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
+) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+    """Deploy of the own error beside effects the share with which held-out blocks are predicted best: stacking.
+
+    What a short record says of the base's own error may be true of that record only.
+    """
+    remainder = found.remainder
+    assert remainder is not None
+    gained, left = held_out.named - held_out.whole, held_out.named
+    known = np.isfinite(gained)
+    helped, size = float(left[known] @ gained[known]), float(gained[known] @ gained[known])
+    share = min(max(helped / max(size, 1e-30), 0.0), 1.0)
+    if share == 0.0:
+        found = dataclasses.replace(found, remainder=None, belongs=False)
+    else:
+        found = dataclasses.replace(found, remainder=remainder.times(share), confirmed=share)
+    return found, effects, dataclasses.replace(held_out, whole=left - share * gained)
 
 
 def _by_channels(

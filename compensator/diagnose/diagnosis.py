@@ -169,6 +169,7 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
         rms_after_um=rms_of(held_out.whole),
         instead=not found.explains,
         belongs=found.belongs,
+        confirmed=found.confirmed,
     )
 
 

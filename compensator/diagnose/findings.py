@@ -42,6 +42,8 @@ class Findings:
         What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
     belongs : bool
         Whether the remainder is that own error, with which the effects were fitted.
+    confirmed : float
+        Share of the remainder that is deployed.
     explains : bool
         Whether the named effects are deployed. Where all channels together explain the data clearly better without
         them, their names say what resembles it most, and the remainder is deployed in their place.
@@ -67,6 +69,7 @@ class Findings:
     paths: Vector
     refitted: Regressed | None
     foresight: Foresight | None = None
+    confirmed: float = 1.0
 
     @property
     def named(self) -> Vector:

@@ -40,7 +40,9 @@ class Remainder:
     instead : bool
         Whether it stands in place of the named effects.
     belongs : bool
-        Whether it is the own error that the named effects were fitted beside, without which they do not hold.
+        Whether it is the own error that the named effects were fitted beside.
+    confirmed : float
+        Share of it that is deployed: of an own error as much as held-out blocks confirm.
     """
 
     deployed: bool
@@ -49,6 +51,7 @@ class Remainder:
     rms_after_um: float
     instead: bool = False
     belongs: bool = False
+    confirmed: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

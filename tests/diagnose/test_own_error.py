@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.diagnose.deployment import _as_far_as_confirmed
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.points import Points
@@ -82,3 +84,21 @@ def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios
     columns, _, _ = record([draw("step", 3, 5.0)], 83, 24.0)
     found = findings_of(evidence_of(BASE, runs_from(columns)))
     assert [term.hypothesis.place[0] for term in found.terms] == ["step"] and found.remainder is None
+
+
+@pytest.mark.parametrize(("helps", "share"), [(1.0, 1.0), (0.4, 0.4), (-0.2, 0.0)])
+def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(helps, share):
+    """Of what it does on the held-out blocks, so much is right there; the rest is true of the record only."""
+    columns, _, _ = record([draw("input", 3, 5.0)], 80, 24.0)
+    found = findings_of(evidence_of(BASE, runs_from(columns)))
+    assert found.belongs
+    random = np.random.default_rng(1)
+    own = found.remainder.added - np.mean(found.remainder.added)
+    noise = random.normal(0.0, 1.0, own.size)
+    noise -= own * (noise @ own) / (own @ own)
+    named = helps * own + noise
+    held_out = HeldOut(base=named, nothing=9.0 * noise, named=named, whole=named - own, ceiling=9.0 * noise, steps=())
+    chosen, _, judged = _as_far_as_confirmed(found, (), held_out)
+    np.testing.assert_allclose(judged.whole, noise + (helps - share) * own, atol=1e-9)
+    np.testing.assert_allclose(chosen.whole, found.named + share * found.remainder.added, atol=1e-9)
+    assert (chosen.remainder is None) == (share == 0.0)

@@ -106,7 +106,9 @@ def test_where_the_remainder_does_the_work_it_is_said() -> None:
     assert "of 5.62 µm rms in the fit, 2.28 is left by it" in words
     assert "explains nothing, corrects that to 0.16." in words and "were found" not in words
     assert tone_of(table) == "warn"
-    assert "they hold only with it" in remainder(table)[0].text()
+    assert "it is the base model's own error" in remainder(table)[0].text()
+    table["remainder"]["confirmed"] = 0.503
+    assert "it is 50 % of the base model's own error" in remainder(table)[0].text()
     other = found(verdict="partly_explained", remainder=rest | {"instead": True}, fit=fit)
     assert "is deployed in its place" in headline(other)
 

@@ -149,7 +149,8 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
         )
 
     monkeypatch.setattr(held_out_module, "findings_of", findings_of)
-    all_of = SimpleNamespace(search=SimpleNamespace(evidence=evidence, grid=None), terms=(), foresight=None)
+    search = SimpleNamespace(evidence=evidence, grid=None)
+    all_of = SimpleNamespace(search=search, terms=(), responses=(), explains=True, foresight=None)
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
     assert (first.searches, second.searches) == (3, 2)
