@@ -25,6 +25,9 @@ from compensator.identify.arx import starts
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure, fit_output_error
 from compensator.progress import Progress, unreported
 
+#: Time constants that differ by less than this share coincide.
+TWINS = 0.05
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
@@ -39,7 +42,7 @@ class Candidate:
     fold_rms : tuple of float
         The same for each fold.
     supported : bool
-        Whether the data determines all of its amplitudes.
+        Whether the data determines its amplitudes, see `is_supported`.
     squares : float
         Sum of squares of the residual of the fit to everything.
     parameters : int
@@ -209,10 +212,25 @@ def _candidate(segments: Sequence[Segment], found: Tried) -> Candidate:
         structure=structure,
         rms=float(np.sqrt(np.mean(np.concatenate(found.errors) ** 2))),
         fold_rms=found.fold_rms,
-        supported=whole.rank_deficit == 0,
+        supported=is_supported(whole),
         squares=float(sum(np.sum(r[s.used] ** 2) for r, s in zip(whole.residuals, segments, strict=True))),
         parameters=structure.parameters + sum(own.size for own in whole.nuisances),
     )
+
+
+def is_supported(fit: OutputErrorFit) -> bool:
+    """Whether the data determines the amplitudes of a fit.
+
+    They may also be so many that large gains cancel on the data, held-out blocks included, and elsewhere run free. Then
+    time constants coincide, and the gain at rest of the first input is less than its standard error.
+    """
+    gain, std = fit.gain()
+    return fit.rank_deficit == 0 and (abs(gain) > std or not coincide(fit.taus_min.tolist()))
+
+
+def coincide(taus_min: Sequence[float]) -> list[float]:
+    """Return time constants, min, that the next longer one exceeds by less than `TWINS`."""
+    return [short for short, long in pairwise(sorted(taus_min)) if long < (1.0 + TWINS) * short]
 
 
 def no_worse(fold_rms: Sequence[float], best: Sequence[float]) -> bool:

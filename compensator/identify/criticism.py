@@ -14,6 +14,7 @@ from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run, is_sparse
 from compensator.display import with_std
 from compensator.identify.calibration import Calibration
+from compensator.identify.choice import coincide
 from compensator.identify.deformation import PathFit
 
 #: Lags of the correlations, samples.
@@ -367,7 +368,7 @@ class _Warnings:
     def twin_modes(self) -> list[Remark]:
         words = []
         for name, path in self.paths.items():
-            twins = [t for t, u in zip(path.taus_min, path.taus_min[1:], strict=False) if u < 1.05 * t]
+            twins = coincide(path.taus_min)
             if twins and name != "TDTF":
                 words.append(
                     Remark(

@@ -22,7 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.calibration import Calibration, with_deformation
-from compensator.identify.choice import Candidate, folds_of
+from compensator.identify.choice import Candidate, folds_of, is_supported
 from compensator.identify.output_error import (
     OutputErrorFit,
     Segment,
@@ -269,7 +269,7 @@ def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: f
             structure=kind,
             rms=float(np.sqrt(np.mean(np.concatenate(own) ** 2))),
             fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in own if e.size),
-            supported=fit.rank_deficit == 0,
+            supported=is_supported(fit),
             squares=float(sum(np.sum(r[s.used] ** 2) for r, s in zip(fit.residuals, one.segments, strict=True))),
             parameters=kind.parameters + sum(n.size for n in fit.nuisances),
             chosen=True,
