@@ -59,8 +59,11 @@ def test_a_fluid_whose_temperature_does_not_move_is_one():
     columns, _, _ = record([Scenario(place=("input", "", "fan_rpm"), act=act)], 1402)
     rng = np.random.default_rng(1402)
     columns["coolant_degc"] = 22.0 + rng.normal(0.0, 0.02, columns["y_um"].size)
+    unclear = diagnose(QUILL, runs_from(columns))
+    assert all(effect.effect.channels != ("fan_rpm", "coolant_degc") for effect in unclear.effects)
+    columns["coolant_lpm"] = columns.pop("fan_rpm") / 100.0
     [effect] = diagnose(QUILL, runs_from(columns)).effects
-    assert effect.effect.channels == ("fan_rpm", "coolant_degc")
+    assert effect.effect.channels == ("coolant_lpm", "coolant_degc")
     assert effect.rms_after_um < 0.35
 
 

@@ -20,6 +20,10 @@ from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
 from compensator.model.effects.seen import Seen, digits, quantity, unit_in, unit_of_channel
 from compensator.model.effects.signals import Signals
 
+#: Units of what can be nothing but a flow. A fluid that stays as warm as it is shows by its flow alone, and beside any
+#: other channel, such as a speed, that is something else which goes by T_Q.
+FLOWS = ("lpm", "l_per_min", "l_per_h", "m3_per_h", "kg_per_min", "gpm")
+
 
 @register
 class Flow(BankEffect, Effect):
@@ -89,6 +93,8 @@ def flows(context: Context) -> Iterator[Hypothesis]:
     one, several = context.tau(), context.bank_min
     for channel in sorted(context.zeroed):
         for fluid in context.temperatures:
+            if fluid not in context.spans and unit_in(channel) not in FLOWS:
+                continue
             place: dict[str, Any] = {"channel": channel, "fluid": fluid, "span": context.spans[channel], "half": 1.0}
             form = f"flow of {fluid}"
             if context.approximate:
