@@ -461,6 +461,7 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
             "rms_after_um": 0.9,
             "instead": False,
             "belongs": False,
+            "confirmed": 1.0,
         },
         "ceiling": {"rms_um": 0.8, "explained_pct": 83.0, "least_rms_um": None},
     }
