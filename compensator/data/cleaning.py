@@ -177,9 +177,8 @@ def _apart(v: Vector, known: Indices, count: int, limit: float) -> Indices:
     if count > 1:
         # Behind a gap a signal may be anywhere.
         apart &= known[count + 1 :] - known[: -count - 1] <= count + SHORT_GAP_SAMPLES
-        beside = np.concatenate(
-            [sliding_window_view(v, 2)[: -count - 2], sliding_window_view(v, 2)[count + 2 :]], axis=1
-        )
+        pairs = sliding_window_view(v, 2)
+        beside = np.concatenate([pairs[: -count - 2], pairs[count + 2 :]], axis=1)
         apart[0] = apart[-1] = False
         apart[1:-1] &= np.ptp(beside, axis=1) < limit
     return np.asarray(known[(np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()])

@@ -140,7 +140,7 @@ def by_channels(found: Findings) -> Findings | None:
         return None
     if not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
         return None
-    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False)
+    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False, confirmed=1.0)
     return instead if _is_no_worse(instead) else None
 
 

@@ -95,7 +95,7 @@ class Continuity:
         return CompensationStatus(
             seq=memory.seq,
             time_utc_ns=memory.time_utc_ns,
-            zero=(Zero.of_references(self._engine, zero, self.outputs.states) if self._engine.has_reference else None),
+            zero=Zero.of_references(self._engine, zero, self.outputs.states) if self._engine.has_reference else None,
             is_known=memory.cold_min <= 0.0,
             target_um=0.0 - prediction.y_um,
             std_um=prediction.std_um,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -129,7 +130,10 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it(
     held_out = HeldOut(
         base=ones, nothing=ones, named=2.0 * ones, whole=2.0 * ones, ceiling=channels_um * ones, steps=()
     )
+    # Where an own error beside the names was confirmed in part, all of the channels are deployed.
+    called_late = dataclasses.replace(called_late, confirmed=0.4)
     found, _, judged = _by_channels(called_late, (), held_out)
+    assert found.confirmed == (0.4 if found is called_late else 1.0)
     assert found.explains is not is_confirmed
     assert judged.whole[0] == (channels_um if is_confirmed else 2.0)
 
