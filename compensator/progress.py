@@ -13,3 +13,8 @@ ExecutorMap = Callable[..., Iterable[Any]]
 
 def unreported(done: int, total: int) -> None:
     """Report nothing."""
+
+
+def after(progress: Progress, steps: int) -> Progress:
+    """Return what reports a calculation that follows these many steps of another as their continuation."""
+    return lambda done, total: progress(steps + done, steps + total)

@@ -127,10 +127,11 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     if fit := found.get("fit"):
         named = fit["named_um"] if found["effects"] else fit["before_um"]
         figures += f" In the fit to all data: {named:.2f} and {fit['after_um']:.2f}."
+    deployed = _why_deployed(rest, named=bool(found["effects"]))
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
         figures,
-        _why_deployed(rest) if rest["deployed"] else "Not deployed in the extended model.",
+        deployed if rest["deployed"] else "Not deployed in the extended model.",
     ]
     return [Words(title="Remainder", lines=lines)]
 
@@ -141,13 +142,14 @@ def _part(rest: Mapping[str, Any]) -> str:
     return "" if share > 0.99 else f"{100.0 * share:.0f} % of "
 
 
-def _why_deployed(rest: Mapping[str, Any]) -> str:
+def _why_deployed(rest: Mapping[str, Any], *, named: bool) -> str:
     """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
     deployed = "Deployed in the extended model"
     if rest.get("belongs"):
+        beside = " that they were fitted beside" if named else ""
         return (
-            f"{deployed} with the named effects: it is {_part(rest)}the base model's own error that they were fitted "
-            "beside, as much of it as predicts held-out data best."
+            f"{deployed}{' with the named effects' if named else ''}: it is {_part(rest)}the base model's own error"
+            f"{beside}, as much of it as predicts held-out data best."
         )
     if rest.get("instead"):
         why = "which leave more on held-out data" if _lowers(rest) else "because all data are more probable with it"

@@ -92,12 +92,32 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
     return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
 
 
+def is_adequate(found: Findings, held_out: HeldOut) -> bool:
+    """Return whether the base model needs nothing.
+
+    It leaves noise with zero and initial state fitted, and little more on held-out blocks: an initial state that
+    takes in most of an effect does not foretell the rest of the record.
+    """
+    evidence = found.search.evidence
+    if found.terms or evidence.free_paths or not _leaves_noise(found):
+        return False
+    return evidence.is_sparse or evidence.noise.is_foretold(rms_of(held_out.nothing))
+
+
+def _leaves_noise(found: Findings) -> bool:
+    """Return whether the base model leaves no more than noise, with zero and initial state fitted."""
+    return found.search.criterion.leaves_noise(found.selection.before)
+
+
 def _with_remainder_that_helps(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
     evidence = found.search.evidence
     if not effects and not evidence.free_paths:
+        if found.belongs and _leaves_noise(found):
+            # What an unknown initial state may absorb is not for the paths to explain.
+            found = dataclasses.replace(found, remainder=None, belongs=False)
         # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
         whole = held_out.whole if found.remainder is not None else held_out.nothing
         held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
@@ -122,7 +142,7 @@ def _with_remainder_that_helps(
 def _as_far_as_confirmed(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
-    """Deploy of the own error beside effects the share with which held-out blocks are predicted best: stacking.
+    """Deploy of the own error the share with which held-out blocks are predicted best: stacking.
 
     What a short record says of the base's own error may be true of that record only.
     """

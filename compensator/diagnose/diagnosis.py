@@ -19,7 +19,7 @@ from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import deployment_of
+from compensator.diagnose.deployment import deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of
@@ -39,7 +39,7 @@ from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
-from compensator.progress import ExecutorMap, Progress, unreported
+from compensator.progress import ExecutorMap, Progress, after, unreported
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
@@ -82,7 +82,8 @@ def diagnose(
     """
     evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
     evidence = evidence_of_runs(runs)
-    progress(0, len(list(evidence.blocks(FOLDS))) + 1)
+    searches = 1 + len(list(evidence.blocks(FOLDS)))
+    progress(0, searches)
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
         found, left_out = without_chips(found, evidence_of_runs)
@@ -96,6 +97,7 @@ def diagnose(
     chosen = deployment_of(found, effects, held_out)
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     if unseen and chosen.base_foretells_better:
+        progress = after(progress, searches)
         return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
@@ -377,8 +379,7 @@ def _verdict(
 
     is_noise = leaves_noise(found.whole)
     if not observed:
-        nothing_acts = is_noise and not evidence.free_paths and found.remainder is None
-        return ("adequate" if nothing_acts else "unexplained"), False
+        return ("adequate" if found.remainder is None and is_adequate(found, held_out) else "unexplained"), False
     if not any(observed):
         return "unexplained", False
 

@@ -41,7 +41,7 @@ class Findings:
     remainder : Regressed or None
         What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
     belongs : bool
-        Whether the remainder is that own error, with which the effects were fitted.
+        Whether the remainder is that own error, with which the effects were fitted; alone where nothing is named.
     confirmed : float
         Share of the remainder that is deployed.
     explains : bool
@@ -155,15 +155,23 @@ def _findings_of(
 ) -> Findings:
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
-    fit, foresight = foreseeing(selection.fit, foresight)
     points = search.points
     nothing = np.zeros(points.count)
     background = Background(evidence)
     channels = background.fitted(points, nothing, selection.before.rest)
+    is_of_paths = False
+    if not selection.fit.terms and not _is_worth_deploying(channels, _log_evidence(selection.before), evidence):
+        selection = search.of_paths(selection)
+        is_of_paths = bool(selection.fit.terms)
+    fit, foresight = foreseeing(selection.fit, foresight)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
     deployed = as_deployed(fit)
-    if late_term(fit):
+    remainder: Regressed | None
+    if is_of_paths:
+        # The error is deployed, the name is for most of it.
+        remainder, explains = own_error(foretelling(selection.before)), False
+    elif late_term(fit):
         remainder, explains = _beside_late(deployed[2]), True
     else:
         remainder, explains = _remainder(search, fit, background, refitted, channels)
@@ -228,12 +236,12 @@ def by_base(evidence: Evidence) -> Vector:
 
 
 def _has_own_error(fit: Fit) -> bool:
-    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact.
+    """Return whether the own error may be deployed: neither paths nor forms are exact, and effects beside it can be.
 
     What the engine leaves of a dead time of T_Q is what it could not foretell, and no error of the paths.
     """
     points, late = fit.likelihood.points, late_term(fit)
-    deployable = any(term.effect.deployable for term in fit.terms)
+    deployable = not fit.terms or any(term.effect.deployable for term in fit.terms)
     foretold = late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
     return deployable and not foretold and not points.is_exact and not points.evidence.is_sparse
 

@@ -21,7 +21,7 @@ from compensator.model.effects.input import NEEDS_CHANNEL
 from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
-REPLACED = " All channels together do better than the names, so the remainder is deployed in its place."
+REPLACED = " A regularised response does better than the names, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
 #: evidence is smaller by no more than this: four times what decides, since forms are known approximately only.
 RIVAL_TIMES, RIVAL_EVIDENCE = 1.2, 20.0

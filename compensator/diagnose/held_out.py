@@ -60,7 +60,15 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     # Another process computes the columns sooner than it gets them.
     grid = found.search.grid if executor_map is map else None
     predicted = executor_map(
-        partial(_predictions, places=places, unobserved=unobserved, grid=grid, foresight=found.foresight), views
+        partial(
+            _predictions,
+            places=places,
+            named=bool(found.terms),
+            unobserved=unobserved,
+            grid=grid,
+            foresight=found.foresight,
+        ),
+        views,
     )
     base = by_base(evidence) + not_deployed(found)[1]
     left = np.full((2, 5 + len(places), evidence.used.size), np.nan)
@@ -100,7 +108,13 @@ class _Predictions:
 
 
 def _predictions(
-    seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid | None, foresight: Foresight | None
+    seen: Evidence,
+    *,
+    places: Sequence[Place],
+    named: bool,
+    unobserved: bool,
+    grid: Grid | None,
+    foresight: Foresight | None,
 ) -> _Predictions:
     found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight)
     steps, total = [], found.own_paths
@@ -110,7 +124,9 @@ def _predictions(
         )
         steps.append(total)
     has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
-    return _Predictions(added=(found.paths, found.named, found.whole, found.ceiling, *steps), has=has)
+    # An own error alone says nothing of one beside effects.
+    whole = found.named if named and found.belongs and not found.terms else found.whole
+    return _Predictions(added=(found.paths, found.named, whole, found.ceiling, *steps), has=has)
 
 
 def how_held_out(evidence: Evidence) -> str:

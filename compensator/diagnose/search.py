@@ -179,6 +179,30 @@ class Search:
         least = -math.inf if self.criterion.something_acts else best.log_evidence + DOUBT
         return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.criterion.score, reverse=True))
 
+    def of_paths(self, selection: Selection) -> Selection:
+        """Return the effect that explains most of what only a large error of the base's own paths explains, if any.
+
+        Such an error is learned from the data and takes any form of timing: it must not keep a change of the paths from
+        its name.
+
+        Parameters
+        ----------
+        selection : Selection
+            A search that found nothing.
+        """
+        nothing = selection.before
+        if not self.evidence.context.approximate or self.evidence.is_sparse or self.criterion.leaves_noise(nothing):
+            return selection
+        all_um2 = self.criterion.rms(()) ** 2
+        by_paths = all_um2 - self.criterion.compared(nothing) ** 2
+        usual = dataclasses.replace(nothing.rest, fast_um=self.points.typical_rest().fast_um)
+        proposed = self._proposed(fit_terms(Likelihood(self.points, usual), []), unobserved=False)
+        named = [fit for fit in proposed if all_um2 - self.criterion.rms(fit.terms) ** 2 > MOSTLY * by_paths]
+        best = max(named, key=self.criterion.score, default=None)
+        if best is None:
+            return selection
+        return dataclasses.replace(selection, fit=best, rivals=(self._rivals(best, 0),), undecided=())
+
     # ------------------------------------------------------------------ steps
 
     def _views(self, fit: Fit) -> list[Rest]:
@@ -208,7 +232,7 @@ class Search:
                 if start[0].effect.jumps:
                     if self._starts_anywhere(fit):
                         continue
-                    start = self._at_its_sample(likelihood, fit, start)  # noqa: PLW2901
+                    start = self._at_best_sample(likelihood, fit, start)  # noqa: PLW2901
                 added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
                 if not self.criterion.is_plausible(added.terms[-1]):
                     continue
@@ -218,7 +242,7 @@ class Search:
                 found.append(max([added, *others], key=self.criterion.score))
         return sorted(found, key=self.criterion.score, reverse=True)
 
-    def _at_its_sample(self, likelihood: Likelihood, fit: Fit, start: Start) -> Start:
+    def _at_best_sample(self, likelihood: Likelihood, fit: Fit, start: Start) -> Start:
         """Return a jump at the sample near its point of the grid that suits it best.
 
         What it leaves is no smooth function of its time: beside a large one a search ends where it begins.

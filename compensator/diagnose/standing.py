@@ -114,8 +114,8 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
     left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
     if rest.get("instead"):
         return (
-            f"What is named resembles the cause most: {left}. All channels together do better: the "
-            f"remainder, which explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
+            f"What is named resembles the cause most: {left}. A regularised response does better: the remainder, which "
+            f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
         )
     return (
         f"What was found explains the error in part: {left}. The remainder, which explains nothing, corrects that to "

@@ -66,6 +66,11 @@ _NOT_IN_FREE_RUN = (
 _NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
 #: The verdict if nothing was named and the channels show some of what acts.
 _WITHOUT_A_NAME = "The model lacks an effect that has no name here; the logged channels show some of it."
+#: The verdict if nothing was named, and a correction of the base's own paths explains much.
+_OWN_PATHS = (
+    "The paths of the model do not fit these data, and no named effect explains it: calibrate the machine anew. Until "
+    "then the remainder corrects the paths."
+)
 #: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
 _FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
@@ -240,7 +245,7 @@ def _words(found: Mapping[str, Any]) -> str:
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
     elif _without_a_name(found):
-        words = _WITHOUT_A_NAME
+        words = _OWN_PATHS if (found.get("remainder") or {}).get("belongs") else _WITHOUT_A_NAME
     return words
 
 

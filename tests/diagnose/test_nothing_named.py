@@ -60,6 +60,20 @@ def test_a_model_that_gets_a_remainder_is_not_called_adequate(monkeypatch):
     assert table["advice"]["unexplained"]["kind"] == "remainder"
 
 
+def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequate(monkeypatch):
+    """An initial state of its slow modes may take in what acts, as far as the record that it is fitted to goes."""
+    held_out_of = diagnosis.held_out_of
+
+    def foretold(*given):
+        found = held_out_of(*given)
+        return dataclasses.replace(found, nothing=10.0 * found.nothing)
+
+    assert figures(diagnose(QUILL, day()))["verdict"] == "adequate"
+    monkeypatch.setattr(diagnosis, "held_out_of", foretold)
+    table = figures(diagnose(QUILL, day()))
+    assert table["verdict"] == "unexplained" and table["effects"] == [] and table["remainder"] is None
+
+
 def test_what_only_the_blocks_named_is_no_error_after(monkeypatch):
     whole = diagnosis.evidence_of(QUILL, day()).count
 

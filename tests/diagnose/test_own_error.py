@@ -14,8 +14,10 @@ from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.points import Points
+from compensator.diagnose.search import Search
 from compensator.diagnose.summary import figures
 from compensator.model.model_file import load_model
+from sim_hardware.drawn_machines.cases import _cases
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
 
@@ -102,3 +104,39 @@ def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(helps, share):
     np.testing.assert_allclose(judged.whole, noise + (helps - share) * own, atol=1e-9)
     np.testing.assert_allclose(chosen.whole, found.named + share * found.remainder.added, atol=1e-9)
     assert (chosen.remainder is None) == (share == 0.0)
+
+
+@pytest.fixture(scope="module")
+def changed():
+    """A machine of which a time constant of 21 min became 16 min; its calibration has modes of 1, 49 and 396 min."""
+    machine = next(c for c in _cases(260_000) if (c.family, c.seed) == ("transfer", 260_034)).draw()
+    return machine, tc.identify(machine.calibration.columns).model
+
+
+def errors_on_another_day(machine, *models):
+    day = machine.fresh
+    return [np.std(day.true_um - tc.simulate(model, day.columns)["y_pred_um"]) for model in models]
+
+
+def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(changed):
+    machine, base = changed
+    why = tc.diagnose(base, machine.record.columns)
+    assert [(effect.kind, effect.path) for effect in why.effects] == [("dynamics", "DTF")]
+    rest = figures(why.diagnosis)["remainder"]
+    assert rest["deployed"] and rest["instead"] and not rest["belongs"]
+    (own,) = why.model.effects
+    assert own.kind == "regression" and set(own.channels) == {"t_q_degc - at_degc", "at_degc"}
+    before_um, after_um = errors_on_another_day(machine, base, why.model)
+    assert after_um < 0.3 * before_um
+
+
+def test_it_is_deployed_alone_where_no_name_explains_most_of_it(changed, monkeypatch):
+    machine, base = changed
+    monkeypatch.setattr(Search, "of_paths", lambda self, selection: selection)
+    why = tc.diagnose(base, machine.record.columns)
+    table = figures(why.diagnosis)
+    assert table["verdict"] == "unexplained" and table["effects"] == []
+    assert table["remainder"]["deployed"] and table["remainder"]["belongs"] and table["remainder"]["confirmed"] > 0.9
+    assert "calibrate the machine anew" in why.summary() and "named effects:" not in why.summary()
+    before_um, after_um = errors_on_another_day(machine, base, why.model)
+    assert after_um < 0.3 * before_um

@@ -141,6 +141,7 @@ def test_paths_that_held_out_blocks_contradict_are_not_deployed(
     assert (again.dtf == model.dtf and again.effects == ()) is not deployed
 
 
+@pytest.mark.usefixtures("found")
 def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, searches, monkeypatch):
     """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
     real, asked = diagnosis_module.findings_of, []
@@ -161,8 +162,10 @@ def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, 
 
         monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
         asked.clear()
-        again = diagnose(model, runs, unseen=True)
+        reported = []
+        again = diagnose(model, runs, unseen=True, progress=lambda *steps, reported=reported: reported.append(steps))
         assert (again.model.dtf == model.dtf) is kept
+        assert [done for done, _ in reported] == sorted(done for done, _ in reported)
         assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is kept
 
 
