@@ -90,7 +90,7 @@ def diagnoses_of_table(
             last = _Part.of(end, base, probe_std_um)
         except CompensatorError:  # too little data in so short an end
             break
-        if last.found.verdict == "adequate":
+        if last.found.diagnosis.shows_nothing:
             # An end in which little moves shows no effect either: it has ended only if the model is better without it.
             best = best if best.holds_after(from_s) else last
         elif last.left < END_IS_BETTER * best.left:
@@ -135,7 +135,7 @@ class _Part:
 
 def _left(found: DiagnosisResult, base: ThermalModel) -> float:
     """Return which part of the error on held-out data a diagnosis leaves; infinite if nothing can be deployed."""
-    if found.verdict == "adequate":
+    if found.diagnosis.shows_nothing:
         return 0.0
     before, after, floor = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um, found.diagnosis.noise_floor_um
     if len(found.model.effects) == len(base.effects):

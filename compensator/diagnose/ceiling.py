@@ -74,10 +74,8 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
         if beside and not beside["deployed"]:
             rest = "nothing is deployed"
         elif beside:
-            lowers = _lowers(beside)
-            rest = (
-                "the remainder corrects some of the rest" if lowers else "the remainder does not lower the error there"
-            )
+            does = "corrects some of the rest" if lowers(beside) else "does not lower the error there"
+            rest = f"the remainder {does}"
         lines.append(
             "The channels show clearly more than the named effects explain, and " + rest + "."
             if found["effects"]
@@ -103,7 +101,7 @@ def _of_all(found: Mapping[str, Any], best: Mapping[str, Any]) -> str:
     )
 
 
-def _lowers(rest: Mapping[str, Any]) -> bool:
+def lowers(rest: Mapping[str, Any]) -> bool:
     """Whether a remainder lowers the error on held-out data by what can be measured."""
     return bool(rest["rms_after_um"] < _MEASURABLE * rest["rms_before_um"])
 
@@ -122,7 +120,7 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     figures = f"Error on held-out data: {before:.2f} µm rms {place}, {after:.2f} {it}."
     if after * _MEASURABLE > before:
         figures += " It increases the error there."
-    elif not _lowers(rest):
+    elif not lowers(rest):
         figures += " It removes nothing there that can be measured."
     if fit := found.get("fit"):
         named = fit["named_um"] if found["effects"] else fit["before_um"]
@@ -146,14 +144,18 @@ def _why_deployed(rest: Mapping[str, Any], *, named: bool) -> str:
     """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
     deployed = "Deployed in the extended model"
     if rest.get("belongs"):
-        beside = " that they were fitted beside" if named else ""
+        place, beside = "", ""
+        if rest.get("instead"):
+            place = " in place of the named effects"
+        elif named:
+            place, beside = " with the named effects", " that they were fitted beside"
         return (
-            f"{deployed}{' with the named effects' if named else ''}: it is {_part(rest)}the base model's own error"
-            f"{beside}, as much of it as predicts held-out data best."
+            f"{deployed}{place}: it is {_part(rest)}the base model's own error{beside}, as much of it as predicts "
+            "held-out data best."
         )
     if rest.get("instead"):
-        why = "which leave more on held-out data" if _lowers(rest) else "because all data are more probable with it"
+        why = "which leave more on held-out data" if lowers(rest) else "because all data are more probable with it"
         return f"{deployed} in place of the named effects, {why}."
-    if not _lowers(rest):
+    if not lowers(rest):
         return f"{deployed}, because all data are more probable with it."
     return f"{deployed}."

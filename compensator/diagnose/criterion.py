@@ -24,6 +24,9 @@ from compensator.model.effects.hypothesis import Hypothesis
 MARGIN = 4.0
 #: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
 UNSEEN = 15.0
+#: A simpler effect gives its name where it explains this share of what a background effect or a large own error
+#: explains, and so do channels in place of a source that no channel shows and that makes up for the effects beside it.
+MOSTLY = 0.7
 #: Columns of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
 
@@ -87,6 +90,23 @@ class Criterion:
             return self.rms(fit.terms)
         left = points.residual - fit.added - points.random(fit.rest) @ likelihood.weights(fit.added)
         return float(np.sqrt(np.mean(left**2)))
+
+    def is_of_paths(self, nothing: Fit) -> bool:
+        """Return whether an own error of the base's paths explains most of what the base leaves: more than noise.
+
+        Parameters
+        ----------
+        nothing : Fit
+            The fit of nothing, where the paths are approximate and not free.
+        """
+        points, likelihood = nothing.likelihood.points, nothing.likelihood
+        if points.is_exact or self._evidence.is_sparse or self.leaves_noise(nothing):
+            return False
+        table, weights = points.random(nothing.rest), likelihood.weights(nothing.added)
+        first = points.zeros.shape[1] + points.starts_of_modes.shape[1]
+        before = points.residual - table[:, :first] @ weights[:first]
+        left = before - table[:, first:] @ weights[first:]
+        return bool(np.mean(left**2) < (1.0 - MOSTLY) * np.mean(before**2))
 
     @property
     def price(self) -> float:

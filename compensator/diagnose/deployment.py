@@ -99,14 +99,9 @@ def is_adequate(found: Findings, held_out: HeldOut) -> bool:
     takes in most of an effect does not foretell the rest of the record.
     """
     evidence = found.search.evidence
-    if found.terms or evidence.free_paths or not _leaves_noise(found):
+    if found.terms or found.remainder is not None or evidence.free_paths or not found.leaves_noise:
         return False
     return evidence.is_sparse or evidence.noise.is_foretold(rms_of(held_out.nothing))
-
-
-def _leaves_noise(found: Findings) -> bool:
-    """Return whether the base model leaves no more than noise, with zero and initial state fitted."""
-    return found.search.criterion.leaves_noise(found.selection.before)
 
 
 def _with_remainder_that_helps(
@@ -115,9 +110,6 @@ def _with_remainder_that_helps(
     """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
     evidence = found.search.evidence
     if not effects and not evidence.free_paths:
-        if found.belongs and _leaves_noise(found):
-            # What an unknown initial state may absorb is not for the paths to explain.
-            found = dataclasses.replace(found, remainder=None, belongs=False)
         # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
         whole = held_out.whole if found.remainder is not None else held_out.nothing
         held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
@@ -148,15 +140,20 @@ def _as_far_as_confirmed(
     """
     remainder = found.remainder
     assert remainder is not None
-    gained, left = held_out.named - held_out.whole, held_out.named
+    without = held_out.nothing if found.is_own_error_alone else held_out.named
+    gained = without - held_out.whole
     known = np.isfinite(gained)
-    helped, size = float(left[known] @ gained[known]), float(gained[known] @ gained[known])
+    helped, size = float(without[known] @ gained[known]), float(gained[known] @ gained[known])
     share = min(max(helped / max(size, 1e-30), 0.0), 1.0)
-    if share == 0.0:
+    whole = without - share * gained
+    if share > 0.0:
+        found = dataclasses.replace(found, remainder=remainder.times(share), confirmed=share)
+    elif found.explains:
         found = dataclasses.replace(found, remainder=None, belongs=False)
     else:
-        found = dataclasses.replace(found, remainder=remainder.times(share), confirmed=share)
-    return found, effects, dataclasses.replace(held_out, whole=left - share * gained)
+        # The name was for an own error that held-out blocks do not confirm.
+        found, effects, held_out = found.without_names(), (), dataclasses.replace(held_out, named=held_out.nothing)
+    return found, effects, dataclasses.replace(held_out, whole=whole)
 
 
 def _by_channels(

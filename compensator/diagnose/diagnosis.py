@@ -379,7 +379,10 @@ def _verdict(
 
     is_noise = leaves_noise(found.whole)
     if not observed:
-        return ("adequate" if found.remainder is None and is_adequate(found, held_out) else "unexplained"), False
+        if is_adequate(found, held_out):
+            return "adequate", False
+        # Noise in the fit, and more on held-out blocks: in the residual is nothing to look for.
+        return "unexplained", found.remainder is None and not evidence.free_paths and found.leaves_noise
     if not any(observed):
         return "unexplained", False
 

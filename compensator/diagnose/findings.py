@@ -9,13 +9,13 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
-from compensator.diagnose.criterion import MARGIN
+from compensator.diagnose.criterion import MARGIN, MOSTLY
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
 from compensator.diagnose.foresight import Foresight, foreseeing
-from compensator.diagnose.own_error import foretelling, own_error
+from compensator.diagnose.own_error import foretelling, own_error, own_error_alone
 from compensator.diagnose.scan import Grid
-from compensator.diagnose.search import MOSTLY, Search, Selection
+from compensator.diagnose.search import Search, Selection
 
 #: The remainder is worth deploying where it adds this much to the logarithm of the evidence, and this share of noise
 #: and own error; where nothing is known of the paths, so are named effects in place of all channels.
@@ -41,12 +41,13 @@ class Findings:
     remainder : Regressed or None
         What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
     belongs : bool
-        Whether the remainder is that own error, with which the effects were fitted; alone where nothing is named.
+        Whether the remainder is that own error: with which the effects were fitted; or alone, where it explains most
+        of what the base leaves, with a name for it in whose place it stands, or without.
     confirmed : float
         Share of the remainder that is deployed.
     explains : bool
-        Whether the named effects are deployed. Where all channels together explain the data clearly better without
-        them, their names say what resembles it most, and the remainder is deployed in their place.
+        Whether the named effects are deployed. Where all channels together, or an own error, explain the data clearly
+        better without them, their names say what resembles it most, and the remainder is deployed in their place.
     channels : Regressed
         What all channels together explain without any named effect.
     paths : numpy.ndarray, shape (n,)
@@ -87,11 +88,35 @@ class Findings:
         return self.channels.added
 
     @property
+    def leaves_noise(self) -> bool:
+        """Whether the base model leaves no more than noise, with zero and initial state fitted."""
+        return self.search.criterion.leaves_noise(self.selection.before)
+
+    @property
+    def is_own_error_alone(self) -> bool:
+        """Whether the own error is deployed without effects beside it."""
+        return self.belongs and not (self.terms and self.explains)
+
+    @property
     def whole(self) -> Vector:
         """What effects and remainder add, µm."""
         if self.remainder is None:
             return self.named
         return np.asarray(sum(self.responses if self.explains else (), self.remainder.added))
+
+    def without_names(self) -> Findings:
+        """Return the findings of a search that named nothing, without a remainder."""
+        selection = dataclasses.replace(self.selection, fit=self.selection.before, rivals=())
+        return dataclasses.replace(
+            self,
+            selection=selection,
+            fit=selection.fit,
+            terms=(),
+            responses=(),
+            remainder=None,
+            belongs=False,
+            explains=True,
+        )
 
     @property
     def rest_um(self) -> float:
@@ -159,27 +184,26 @@ def _findings_of(
     nothing = np.zeros(points.count)
     background = Background(evidence)
     channels = background.fitted(points, nothing, selection.before.rest)
-    is_of_paths = False
-    if not selection.fit.terms and not _is_worth_deploying(channels, _log_evidence(selection.before), evidence):
-        selection = search.of_paths(selection)
-        is_of_paths = bool(selection.fit.terms)
+    worth = _is_worth_deploying(channels, _log_evidence(selection.before), evidence)
+    is_of_paths = not selection.fit.terms and not worth and search.criterion.is_of_paths(selection.before)
+    if is_of_paths:
+        selection = search.of_paths(selection.before) or selection
     fit, foresight = foreseeing(selection.fit, foresight)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
     deployed = as_deployed(fit)
     remainder: Regressed | None
+    belongs = False
     if is_of_paths:
-        # The error is deployed, the name is for most of it.
-        remainder, explains = own_error(foretelling(selection.before)), False
+        remainder, explains, belongs = own_error_alone(selection.before), not selection.fit.terms, True
     elif late_term(fit):
         remainder, explains = _beside_late(deployed[2]), True
     else:
         remainder, explains = _remainder(search, fit, background, refitted, channels)
-    belongs = remainder is None and _has_own_error(fit)
-    if belongs:
+    if remainder is None and _has_own_error(fit):
         fit = foretelling(fit)
         deployed = as_deployed(fit)
-        remainder = own_error(deployed[2])
+        remainder, belongs = own_error(deployed[2]), True
     terms, responses, _ = deployed
     return Findings(
         search=search,
@@ -236,12 +260,12 @@ def by_base(evidence: Evidence) -> Vector:
 
 
 def _has_own_error(fit: Fit) -> bool:
-    """Return whether the own error may be deployed: neither paths nor forms are exact, and effects beside it can be.
+    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact.
 
     What the engine leaves of a dead time of T_Q is what it could not foretell, and no error of the paths.
     """
     points, late = fit.likelihood.points, late_term(fit)
-    deployable = not fit.terms or any(term.effect.deployable for term in fit.terms)
+    deployable = any(term.effect.deployable for term in fit.terms)
     foretold = late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
     return deployable and not foretold and not points.is_exact and not points.evidence.is_sparse
 

@@ -13,6 +13,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
+from compensator.diagnose.own_error import own_error_alone
 from compensator.diagnose.scan import Grid
 from compensator.model.effects.hypothesis import Place
 from compensator.progress import ExecutorMap, Progress
@@ -63,7 +64,7 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
         partial(
             _predictions,
             places=places,
-            named=bool(found.terms),
+            own_alone=found.is_own_error_alone,
             unobserved=unobserved,
             grid=grid,
             foresight=found.foresight,
@@ -111,7 +112,7 @@ def _predictions(
     seen: Evidence,
     *,
     places: Sequence[Place],
-    named: bool,
+    own_alone: bool,
     unobserved: bool,
     grid: Grid | None,
     foresight: Foresight | None,
@@ -124,8 +125,10 @@ def _predictions(
         )
         steps.append(total)
     has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
-    # An own error alone says nothing of one beside effects.
-    whole = found.named if named and found.belongs and not found.terms else found.whole
+    # An own error alone and one beside effects say nothing of each other.
+    whole = found.named if found.is_own_error_alone else found.whole
+    if own_alone:
+        whole = own_error_alone(found.selection.before).added
     return _Predictions(added=(found.paths, found.named, whole, found.ceiling, *steps), has=has)
 
 

@@ -25,7 +25,7 @@ EXPECTED_TIMES = 1.4
 #: For the verdict, what is left counts as noise up to this many times its level (rms).
 VERDICT_TIMES = 1.5
 #: A base model is adequate only where it leaves no more than this many times its level on held-out blocks (rms).
-FORETOLD_TIMES = 2.0
+FORETOLD_TIMES = 2.5
 #: Few values whose noise is stated leave no more than this quantile of what chance makes of it.
 CHANCE = 0.99
 #: An impulse, as long as the slow modes need.
@@ -64,7 +64,7 @@ class NoiseTest:
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_foretold(self, rms_um: float) -> bool:
-        """Return whether what is left on held-out blocks may be noise and own error, with the zero of the others."""
+        """Return whether what a base leaves on held-out blocks may be noise and own error."""
         return rms_um**2 < FORETOLD_TIMES**2 * (self.noise_um**2 + (OWN_TIMES * self.own_error_um) ** 2)
 
     def is_explained(self, cost: float) -> bool:

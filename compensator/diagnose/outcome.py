@@ -40,7 +40,7 @@ class Remainder:
     instead : bool
         Whether it stands in place of the named effects.
     belongs : bool
-        Whether it is the own error that the named effects were fitted beside.
+        Whether it is the base's own error: beside named effects, in their place, or alone.
     confirmed : float
         Share of it that is deployed: of an own error as much as held-out blocks confirm.
     """
@@ -156,6 +156,14 @@ class Diagnosis:
     ceiling: Ceiling | None = None
     advice: Advice | None = None
     could_hide: DetectionLimits | None = None
+
+    @property
+    def shows_nothing(self) -> bool:
+        """Whether the base leaves noise where it is fitted to; held-out blocks may still speak against it."""
+        if self.verdict == "adequate" or self.could_hide is not None:
+            return self.verdict == "adequate"
+        nothing_left = self.advice is None or self.advice.unexplained is None
+        return not self.effects and self.remainder is None and nothing_left
 
     @property
     def before(self) -> Scores:

@@ -1,4 +1,4 @@
-"""What the data say of the base's own error beside named effects: the part of the likelihood that has no name.
+"""What the data say of the base's own error, beside named effects or alone: the part of the likelihood without a name.
 
 The likelihood grants the base's paths an error of their own, and every effect one of its form. How large these were is
 known once the data are seen. Effects that were fitted beside them are right only together with them: what both explain
@@ -29,6 +29,17 @@ def foretelling(fit: Fit) -> Fit:
     """
     points = fit.likelihood.points
     return settled(fit_terms(Likelihood(points.of(points.evidence, foretells=True), fit.rest), fit.starts()))
+
+
+def own_error_alone(nothing: Fit) -> Regressed:
+    """Return the own error of the paths where no effect is deployed.
+
+    Parameters
+    ----------
+    nothing : Fit
+        The fit of nothing.
+    """
+    return own_error(foretelling(nothing))
 
 
 def own_error(fit: Fit) -> Regressed:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.diagnose.criterion import Criterion
+from compensator.diagnose.criterion import MOSTLY, Criterion
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, learned_rest
@@ -32,9 +32,8 @@ DOUBT = 4.5
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
 ALIAS_FREE = 3.0
-#: A simpler effect gives its name where it explains this share of what a background effect explains, and so do channels
-#: in place of a source that no channel shows and that makes up for the effects beside it.
-MOSTLY = 0.7
+#: Kinds of what may change in a path that stays linear.
+OF_PATHS = ("dynamics", "gain", "delay")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,29 +178,32 @@ class Search:
         least = -math.inf if self.criterion.something_acts else best.log_evidence + DOUBT
         return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.criterion.score, reverse=True))
 
-    def of_paths(self, selection: Selection) -> Selection:
-        """Return the effect that explains most of what only a large error of the base's own paths explains, if any.
+    def of_paths(self, nothing: Fit) -> Selection | None:
+        """Return a change of the paths that explains most of what the base leaves, in the place of a large own error.
 
         Such an error is learned from the data and takes any form of timing: it must not keep a change of the paths from
-        its name.
+        its name. Beside one of the usual size that change shows.
 
         Parameters
         ----------
-        selection : Selection
-            A search that found nothing.
+        nothing : Fit
+            The fit of nothing, of which the own error explains most (`Criterion.is_of_paths`).
         """
-        nothing = selection.before
-        if not self.evidence.context.approximate or self.evidence.is_sparse or self.criterion.leaves_noise(nothing):
-            return selection
-        all_um2 = self.criterion.rms(()) ** 2
-        by_paths = all_um2 - self.criterion.compared(nothing) ** 2
         usual = dataclasses.replace(nothing.rest, fast_um=self.points.typical_rest().fast_um)
-        proposed = self._proposed(fit_terms(Likelihood(self.points, usual), []), unobserved=False)
-        named = [fit for fit in proposed if all_um2 - self.criterion.rms(fit.terms) ** 2 > MOSTLY * by_paths]
-        best = max(named, key=self.criterion.score, default=None)
-        if best is None:
-            return selection
-        return dataclasses.replace(selection, fit=best, rivals=(self._rivals(best, 0),), undecided=())
+        beside_usual = fit_terms(Likelihood(self.points, usual), [])
+        before_um2 = self.criterion.rms(()) ** 2
+        named = [
+            fit
+            for fit in self._proposed(beside_usual, unobserved=False)
+            if (effect := fit.terms[0].hypothesis.effect).kind in OF_PATHS
+            and effect.lateness is None
+            and before_um2 - self.criterion.rms(fit.terms) ** 2 > MOSTLY * before_um2
+        ]
+        if not named:
+            return None
+        # What can absorb any change of the paths is the own error once more.
+        best = min(named, key=lambda fit: (fit.terms[0].hypothesis.effect.background, -self.criterion.score(fit)))
+        return Selection(before=nothing, fit=best, rivals=(self._rivals(best, 0),))
 
     # ------------------------------------------------------------------ steps
 

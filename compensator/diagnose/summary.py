@@ -12,7 +12,7 @@ import numpy as np
 from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
-from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
+from compensator.diagnose.ceiling import ceiling, explained, falls_short, lowers, named_rms, remainder
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
@@ -70,6 +70,11 @@ _WITHOUT_A_NAME = "The model lacks an effect that has no name here; the logged c
 _OWN_PATHS = (
     "The paths of the model do not fit these data, and no named effect explains it: calibrate the machine anew. Until "
     "then the remainder corrects the paths."
+)
+#: The verdict if the base leaves noise where it is fitted to, and clearly more on held-out data.
+_FORETELLS_LESS = (
+    "Something acts, or the record began warm: with its zero and initial state fitted, the model leaves noise, but it "
+    "does not foretell the rest of the record. Record longer, or begin at rest."
 )
 #: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
 _FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
@@ -244,8 +249,11 @@ def _words(found: Mapping[str, Any]) -> str:
         words = said
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
+    elif _foretells_less(found):
+        words = _FORETELLS_LESS
     elif _without_a_name(found):
-        words = _OWN_PATHS if (found.get("remainder") or {}).get("belongs") else _WITHOUT_A_NAME
+        rest = found.get("remainder") or {}
+        words = _OWN_PATHS if rest.get("belongs") and lowers(rest) else _WITHOUT_A_NAME
     return words
 
 
@@ -253,6 +261,13 @@ def _without_a_name(found: Mapping[str, Any]) -> bool:
     """Whether something acts that the channels show and that has no name."""
     shown = bool(found.get("remainder")) or falls_short(found)
     return found["verdict"] == "unexplained" and not found["effects"] and shown and not _cannot_show(found)
+
+
+def _foretells_less(found: Mapping[str, Any]) -> bool:
+    """Whether nothing is left to look for in the fit, and the base is not adequate all the same."""
+    nothing = found["verdict"] == "unexplained" and not found["effects"] and not found.get("remainder")
+    advice = found.get("advice")
+    return nothing and "could_hide" not in found and advice is not None and advice["unexplained"] is None
 
 
 def _cannot_show(found: Mapping[str, Any]) -> bool:

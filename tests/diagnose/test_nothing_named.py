@@ -72,6 +72,7 @@ def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequa
     monkeypatch.setattr(diagnosis, "held_out_of", foretold)
     table = figures(diagnose(QUILL, day()))
     assert table["verdict"] == "unexplained" and table["effects"] == [] and table["remainder"] is None
+    assert "does not foretell the rest" in verdict(table) and table["advice"]["unexplained"] is None
 
 
 def test_what_only_the_blocks_named_is_no_error_after(monkeypatch):

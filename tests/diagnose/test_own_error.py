@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import compensator as tc
-from compensator.diagnose.deployment import _as_far_as_confirmed
+from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
@@ -123,7 +125,9 @@ def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(chan
     why = tc.diagnose(base, machine.record.columns)
     assert [(effect.kind, effect.path) for effect in why.effects] == [("dynamics", "DTF")]
     rest = figures(why.diagnosis)["remainder"]
-    assert rest["deployed"] and rest["instead"] and not rest["belongs"]
+    assert rest["deployed"] and rest["instead"] and rest["belongs"]
+    assert why.effects[0].term.hypothesis.form == "mistimed 49"
+    assert "in place of the named effects: it is the base model's own error" in why.summary()
     (own,) = why.model.effects
     assert own.kind == "regression" and set(own.channels) == {"t_q_degc - at_degc", "at_degc"}
     before_um, after_um = errors_on_another_day(machine, base, why.model)
@@ -132,7 +136,7 @@ def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(chan
 
 def test_it_is_deployed_alone_where_no_name_explains_most_of_it(changed, monkeypatch):
     machine, base = changed
-    monkeypatch.setattr(Search, "of_paths", lambda self, selection: selection)
+    monkeypatch.setattr(Search, "of_paths", lambda self, nothing: None)
     why = tc.diagnose(base, machine.record.columns)
     table = figures(why.diagnosis)
     assert table["verdict"] == "unexplained" and table["effects"] == []
@@ -140,3 +144,29 @@ def test_it_is_deployed_alone_where_no_name_explains_most_of_it(changed, monkeyp
     assert "calibrate the machine anew" in why.summary() and "named effects:" not in why.summary()
     before_um, after_um = errors_on_another_day(machine, base, why.model)
     assert after_um < 0.3 * before_um
+
+
+def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_it(changed):
+    machine, base = changed
+    runs, _ = runs_in(measurements(machine.record.columns, "data", None), base.period_s)
+    found = findings_of(evidence_of(base, runs))
+    assert found.is_own_error_alone and found.terms and not found.explains
+    nothing = found.search.evidence.residual
+    held_out = HeldOut(
+        base=nothing, nothing=nothing, named=0.5 * nothing, whole=1.5 * nothing, ceiling=2.0 * nothing, steps=()
+    )
+    chosen = deployment_of(found, (), held_out)
+    assert chosen.found.terms == () and chosen.found.remainder is None and chosen.effects == ()
+    np.testing.assert_array_equal(chosen.held_out.whole, nothing)
+
+
+@pytest.mark.parametrize(("seed", "tau_min"), [(80, 60.0), (83, 200.0)])
+def test_what_no_path_explains_is_given_no_path_s_name(seed, tau_min):
+    """Y wanders by itself: of that the own error of the paths takes in a little, as it does of anything."""
+    columns, _, _ = record([], seed, 24.0)
+    keep = np.exp(-1.0 / tau_min)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0 * np.sqrt(1.0 - keep**2), columns["y_um"].size)
+    wandering = lfilter([1.0], [1.0, -keep], noise)
+    kept = {name: columns[name] for name in ("t_q_degc", "at_degc")}
+    found = findings_of(evidence_of(BASE, runs_from(kept | {"y_um": columns["y_um"] + wandering})))
+    assert not found.leaves_noise and found.terms == () and not found.belongs

@@ -14,6 +14,7 @@ import pytest
 
 import compensator as tc
 from compensator.diagnose import held_out as held_out_module
+from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
 from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
@@ -146,11 +147,14 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
             named=large + (count - 1) * small,
             whole=large + (count - 1) * small,
             ceiling=nothing,
+            is_own_error_alone=False,
         )
 
     monkeypatch.setattr(held_out_module, "findings_of", findings_of)
     search = SimpleNamespace(evidence=evidence, grid=None)
-    all_of = SimpleNamespace(search=search, terms=(), responses=(), explains=True, foresight=None)
+    all_of = SimpleNamespace(
+        search=search, terms=(), responses=(), explains=True, foresight=None, is_own_error_alone=False
+    )
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
     assert (first.searches, second.searches) == (3, 2)
@@ -377,8 +381,14 @@ def test_what_only_the_remainder_corrects_is_not_called_unseen(found: Diagnosis)
     assert "has no name here" in page(alone).verdict and "no channel shows" not in page(alone).verdict
     assert page(alone).tone == "warn"
     # Where the channels show nothing of it, that is said.
-    unseen = dataclasses.replace(alone, remainder=None, ceiling=None)
+    left = Unexplained(
+        kind="residual", rms_um=2.0, peak_to_peak_um=6.0, tau_min=60.0, times=(), goes_with=None, sensor_evidence=9.0
+    )
+    unseen = dataclasses.replace(alone, remainder=None, ceiling=None, advice=Advice(unexplained=left))
     assert "no channel shows" in page(unseen).verdict and "has no name here" not in page(unseen).verdict
+    # Or that nothing is left of it in the fit, and held-out blocks have more.
+    absorbed = dataclasses.replace(unseen, advice=Advice())
+    assert "does not foretell the rest of the record" in page(absorbed).verdict and page(absorbed).tone == "warn"
 
 
 def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothing(found: Diagnosis) -> None:
