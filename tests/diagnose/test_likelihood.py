@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from compensator.diagnose import likelihood as likelihood_module
-from compensator.diagnose.background import Background
+from compensator.diagnose.background import Background, _Problem
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
@@ -133,6 +133,19 @@ def test_slopes_of_the_evidence_are_those_of_differences(evidence, monkeypatch):
         Background(evidence).fitted(points, np.zeros(points.count), REST)
     got, wanted = np.array(seen).T
     assert got == pytest.approx(wanted, rel=0.01, abs=0.01)
+
+
+def test_all_lags_of_a_channel_have_gains_of_one_expected_size(evidence):
+    """A long lag moves little in a record: as large in it as a short one, it would be the largest on a longer day."""
+    points = Points(evidence)
+    background = Background(evidence)
+    problem = _Problem(background, points, np.zeros(points.count))
+    moves = np.std(points.averaged(background.columns), axis=0)
+    for group in range(len(background.template.channels)):
+        lags = background.groups == group
+        assert np.ptp(problem.scale[lags]) == 0.0
+        assert np.max(np.std(problem.table[:, lags], axis=0)) == pytest.approx(1.0)
+    assert np.min(moves / problem.scale) < 0.7
 
 
 def test_a_search_without_some_data_uses_the_columns_of_the_whole(evidence):
