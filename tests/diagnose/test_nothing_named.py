@@ -70,8 +70,11 @@ def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequa
 
     assert figures(diagnose(QUILL, day()))["verdict"] == "adequate"
     monkeypatch.setattr(diagnosis, "held_out_of", foretold)
-    table = figures(diagnose(QUILL, day()))
+    found = diagnose(QUILL, day())
+    table = figures(found)
     assert table["verdict"] == "unexplained" and table["effects"] == [] and table["remainder"] is None
+    # The loop asks this: an end in which nothing acts any more may be short.
+    assert found.shows_nothing
     assert "does not foretell the rest" in verdict(table) and table["advice"]["unexplained"] is None
 
 
