@@ -152,11 +152,13 @@ class _Problem:
     def __init__(self, background: Background, points: Points, explained: Vector) -> None:
         self.background, self.points = background, points
         table = points.averaged(background.columns)
-        # All lags of a channel have gains of one expected size: what moved little in the record is to be small.
-        moves = np.std(table, axis=0)
-        self.scale = np.array([np.max(moves[background.groups == group]) for group in background.groups])
+        moves = self.scale = np.std(table, axis=0)
+        if not points.evidence.free_paths:
+            # All lags of a channel have gains of one expected size: what moved little in the record is to be small.
+            self.scale = np.array([np.max(moves[background.groups == group]) for group in background.groups])
         # What is left of a channel that moves only in what is held out says nothing.
-        self.scale[moves < np.maximum(STILL * np.max(np.abs(background.columns), axis=0), 1e-12)] = np.inf
+        still = moves < np.maximum(STILL * np.max(np.abs(background.columns), axis=0), 1e-12)
+        self.scale = np.where(still, np.inf, self.scale)
         self.table = table / self.scale
         random = np.concatenate([points.zeros, points.starts_of_modes], axis=1)
         self._fixed = random.shape[1]
