@@ -142,12 +142,14 @@ class Criterion:
         if self._evidence.free_paths:
             # What is left without it is the whole deformation: only the evidence says what it is worth.
             return True
-        effect, others = term.hypothesis.effect, self._evidence.context.approximate and len(fit.terms) > 1
-        share = effect.worth_with_others if others else effect.worth
+        effect, approximate = term.hypothesis.effect, self._evidence.context.approximate
+        others, without_um2 = len(fit.terms) > 1, self.rms(without.terms) ** 2
+        if approximate and not others and without_um2 - self.rms(fit.terms) ** 2 < effect.removes_alone * without_um2:
+            return False
+        share = effect.worth_with_others if approximate and others else effect.worth
         added = np.where(self._evidence.used, response(self._evidence, term), 0.0)
         size = float(np.sum(self._evidence.without_nuisances(added) ** 2))
-        left = (self.rms(without.terms) ** 2) * self._evidence.count + self._evidence.noise.allowance
-        return size > share * left
+        return size > share * (without_um2 * self._evidence.count + self._evidence.noise.allowance)
 
     def is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""

@@ -247,3 +247,17 @@ def test_an_effect_is_exchanged_for_another_form_of_itself():
     assert [(term.hypothesis.place, term.hypothesis.form) for term in terms] == [
         (("input", "", "fan_rpm"), "lag and delay")
     ]
+
+
+@pytest.mark.parametrize(("own_um", "share", "is_named"), [(0.6, 0.25, False), (0.6, 0.6, True), (None, 0.25, True)])
+def test_a_delay_alone_beside_an_error_of_timing_removes_at_least_half(own_um, share, is_named):
+    """A quarter of a dead time removes 1 − 0.75² of the mean square: the calibration may miss as much by itself."""
+    columns, _, _ = record([draw("late path", 4)], 80, 12.0)
+    base = dataclasses.replace(QUILL, held_out_rms_um=own_um)
+    search = Search(evidence_of(base, runs_from(columns)))
+    selection = search.run()
+    (term,) = selection.fit.terms
+    assert term.hypothesis.place == ("delay", "DTF", "")
+    less = dataclasses.replace(term, values=tuple(share * value for value in term.values))
+    fit = dataclasses.replace(selection.fit, terms=(less,))
+    assert search.criterion.is_worth_naming(less, selection.before, fit) is is_named

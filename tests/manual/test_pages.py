@@ -60,7 +60,8 @@ def settings_of_diagnosis() -> dict[str, tuple[float, ...]]:
         targets = [name for node in assigned for target in node.targets for name in ast.walk(target)]
         found |= {f"{file.stem}.{t.id}": getattr(module, t.id) for t in targets if isinstance(t, ast.Name)}
     for form in {base for effect in forms() for base in effect.__mro__ if issubclass(base, Effect)}:
-        found |= {f"{form.__name__}.{k}": v for k, v in vars(form).items() if k in ("worth", "worth_with_others")}
+        asked = ("worth", "worth_with_others", "removes_alone")
+        found |= {f"{form.__name__}.{k}": v for k, v in vars(form).items() if k in asked}
     rows = {
         name: tuple(np.atleast_1d(v)) for name, v in found.items() if isinstance(v, int | float | tuple | np.ndarray)
     }

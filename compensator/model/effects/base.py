@@ -118,6 +118,8 @@ class Effect:
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.25
+    #: Least share of the mean square that it removes where it is named alone and forms are approximate.
+    removes_alone: ClassVar[float] = 0.0
     #: Whether it jumps at a time, and whether its unknown initial state looks like such a jump.
     jumps: ClassVar[bool] = False
     starts_anywhere: ClassVar[bool] = False

@@ -28,7 +28,8 @@ class DelayedPath(Effect):
     """A delayed path."""
 
     kind = "delay"
-    worth_with_others = 0.6
+    # The timing of an identified path has an error of its own.
+    worth_with_others, removes_alone = 0.6, 0.5
     path: str = text("DTF", "TDTF")
     delay_min: float = number(0.0, 1440.0)
     lag_min: float = number(0.0, 1440.0)
