@@ -184,8 +184,11 @@ def _findings_of(
     nothing = np.zeros(points.count)
     background = Background(evidence)
     channels = background.fitted(points, nothing, selection.before.rest)
-    worth = _is_worth_deploying(channels, _log_evidence(selection.before), evidence)
-    is_of_paths = not selection.fit.terms and not worth and search.criterion.is_of_paths(selection.before)
+    is_of_paths = (
+        not selection.fit.terms
+        and search.criterion.is_of_paths(selection.before)
+        and not _is_worth_deploying(channels, _log_evidence(selection.before), evidence)
+    )
     if is_of_paths:
         selection = search.of_paths(selection.before) or selection
     fit, foresight = foreseeing(selection.fit, foresight)

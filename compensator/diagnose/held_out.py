@@ -128,7 +128,8 @@ def _predictions(
     # An own error alone and one beside effects say nothing of each other.
     whole = found.named if found.is_own_error_alone else found.whole
     if own_alone:
-        whole = own_error_alone(found.selection.before).added
+        own = found.remainder if found.is_own_error_alone else None
+        whole = (own or own_error_alone(found.selection.before)).added
     return _Predictions(added=(found.paths, found.named, whole, found.ceiling, *steps), has=has)
 
 

@@ -160,10 +160,9 @@ class Diagnosis:
     @property
     def shows_nothing(self) -> bool:
         """Whether the base leaves noise where it is fitted to; held-out blocks may still speak against it."""
-        if self.verdict == "adequate" or self.could_hide is not None:
-            return self.verdict == "adequate"
         nothing_left = self.advice is None or self.advice.unexplained is None
-        return not self.effects and self.remainder is None and nothing_left
+        nothing_found = not self.effects and self.remainder is None and self.could_hide is None
+        return self.verdict == "adequate" or (nothing_found and nothing_left)
 
     @property
     def before(self) -> Scores:
