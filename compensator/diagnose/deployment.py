@@ -23,9 +23,10 @@ from compensator.diagnose.outcome import rms_of
 CONTRADICTS, CONTRADICTS_ANEW = 1.25, 2.5
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
-#: Beside a late T_Q it is for the minutes that a dead time hides: they are most of what is left, or something else is
-#: (set on 8 drawn machines, where less than this made the fresh run no better, and on 2 of another simulator).
-LOWERS_LATE = 0.75
+#: The same of many values in two cases. Beside a late T_Q a remainder is for the minutes that a dead time hides: they
+#: are most of what is left, or something else is (set on 8 drawn machines, where less than this made the fresh run no
+#: better, and on 2 of another simulator). All channels that take the place of names have nothing but this to show.
+LOWERS_CLEARLY = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +123,7 @@ def _with_remainder_that_helps(
         # Few values: chance lowers the error of no remainder by much.
         helps = whole_um < LOWERS * min(named_um, nothing_um)
     elif late_term(found.selection.fit):
-        helps = whole_um < LOWERS_LATE * named_um
+        helps = whole_um < LOWERS_CLEARLY * named_um
     else:
         helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
     if helps:
@@ -160,8 +161,8 @@ def _by_channels(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Deploy all channels in the place of names with which the engine is worse, where held-out data confirm them."""
-    instead = by_channels(found)
-    if instead is None or rms_of(held_out.ceiling) > min(map(rms_of, (held_out.whole, held_out.nothing))):
+    instead, (whole_um, nothing_um) = by_channels(found), map(rms_of, (held_out.whole, held_out.nothing))
+    if instead is None or rms_of(held_out.ceiling) > min(whole_um, LOWERS_CLEARLY * nothing_um):
         return found, effects, held_out
     effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)

@@ -24,7 +24,7 @@ from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.fit import Term, fit_terms
-from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
+from compensator.diagnose.found_effect import FoundEffect, described, no_further_than_seen, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
@@ -268,6 +268,7 @@ def _extended(
         remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
     if remainder is not None:
         seen = seen_of(remainder, found.whole - found.named, evidence)
+        remainder = no_further_than_seen(remainder, evidence)
         deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(seen)))
     if not deployed and base is model:
         return model, ()

@@ -16,8 +16,10 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
+from compensator.model.effects.base import filters
 from compensator.model.effects.hypothesis import Place
 from compensator.model.effects.input import NEEDS_CHANNEL
+from compensator.model.effects.regression import Regression
 from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
@@ -195,6 +197,17 @@ def seen_of(effect: Effect, signal: Vector, evidence: Evidence) -> Seen:
         channel=Range.of([record.channels[effect.channel] for record in records]) if effect.channel else None,
         path_um=Range.of([record.share(effect.path) for record in records]) if effect.path else None,
     )
+
+
+def no_further_than_seen(remainder: Regression, evidence: Evidence) -> Regression:
+    """Return a remainder that goes no further to either side than the whole range in which the data showed it.
+
+    It explains nothing, so nothing says that it holds where the machine does what the data did not show.
+    """
+    blocks = remainder.blocks(evidence.context.period_min)
+    added = np.concatenate([remainder.law(record, filters(blocks)) for record in evidence.signals])[evidence.used]
+    most_um = float(max(np.max(added), 0.0) - min(np.min(added), 0.0))
+    return dataclasses.replace(remainder, most_um=most_um)
 
 
 def rivals_of(

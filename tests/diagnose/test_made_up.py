@@ -122,20 +122,21 @@ def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(cal
     assert in_free_run(instead)[1] < 0.5 * before_um and by_channels(instead) is None
 
 
-@pytest.mark.parametrize(("channels_um", "is_confirmed"), [(0.9, True), (1.1, False)])
-def test_all_channels_take_their_place_where_held_out_data_confirm_it(
-    called_late: Findings, channels_um: float, is_confirmed: bool
+@pytest.mark.parametrize(
+    ("channels_um", "named_um", "is_confirmed"), [(0.7, 2.0, True), (0.8, 2.0, False), (0.7, 0.6, False)]
+)
+def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
+    called_late: Findings, channels_um: float, named_um: float, is_confirmed: bool
 ) -> None:
     ones = np.ones(called_late.ceiling.size)
-    held_out = HeldOut(
-        base=ones, nothing=ones, named=2.0 * ones, whole=2.0 * ones, ceiling=channels_um * ones, steps=()
-    )
+    named = named_um * ones
+    held_out = HeldOut(base=ones, nothing=ones, named=named, whole=named, ceiling=channels_um * ones, steps=())
     # Where an own error beside the names was confirmed in part, all of the channels are deployed.
     called_late = dataclasses.replace(called_late, confirmed=0.4)
     found, _, judged = _by_channels(called_late, (), held_out)
     assert found.confirmed == (0.4 if found is called_late else 1.0)
     assert found.explains is not is_confirmed
-    assert judged.whole[0] == (channels_um if is_confirmed else 2.0)
+    assert judged.whole[0] == (channels_um if is_confirmed else named_um)
 
 
 def test_it_is_said_why_nothing_is_deployed() -> None:

@@ -73,6 +73,11 @@ def test_a_model_with_it_errs_less_on_another_day(scenarios):
     *named, own = why.model.effects
     assert own.kind == "regression" and own.std_factor
     assert figures(why.diagnosis)["remainder"]["deployed"]
+    # It goes as far as it was seen to go, and no further.
+    bare = dataclasses.replace(why.model, effects=tuple(named), sha256="")
+    added = np.subtract(*(tc.simulate(model, table)["y_pred_um"] for model in (why.model, bare)))
+    assert own.most_um == pytest.approx(max(added.max(), 0.0) - min(added.min(), 0.0), rel=0.02)
+    assert np.abs(added).max() < own.most_um
     fresh, true, _ = record(scenarios, 81, 24.0)
     errors = []
     for effects in ((*named, own), named):

@@ -52,6 +52,8 @@ REMAINDER = Regression(
         (0.0,) * 9 + (0.2,) + (0.0,) * 5,
     ),
 )
+#: It would go further at both ends of the record.
+LIMITED = dataclasses.replace(REMAINDER, most_um=3.0)
 N = 300
 RANDOM = np.random.default_rng(11)
 AT = 20.0 + 0.8 * np.sin(np.arange(N) / 60.0)
@@ -137,10 +139,16 @@ def test_its_columns_over_a_record_are_what_the_gains_weight() -> None:
     assert not found[:21, :3].any() and np.array_equal(found[20:, 0], late[20:] - late[20])
 
 
-@pytest.mark.parametrize("base", [QUILL, INVERSE], ids=["kalman", "inverse"])
-def test_stream_equals_batch_over_gaps_and_from_every_snapshot_to_the_bit(base: ThermalModel) -> None:
+@pytest.mark.parametrize(
+    ("base", "effect"),
+    [(QUILL, REMAINDER), (INVERSE, REMAINDER), (QUILL, LIMITED)],
+    ids=["kalman", "inverse", "limited"],
+)
+def test_stream_equals_batch_over_gaps_and_from_every_snapshot_to_the_bit(
+    base: ThermalModel, effect: Regression
+) -> None:
     t_q, at, channels = holed()
-    model = with_remainder(base=base)
+    model = with_remainder(effect, base)
     batch = started(model).run(t_q, at, channels)
     engine = started(model)
     for k in range(N):
@@ -173,6 +181,22 @@ def test_without_a_factor_the_standard_deviation_keeps_its_bits() -> None:
     bare, found = (started(model).run(t_q, at, CHANNELS) for model in (QUILL, with_remainder(silent)))
     assert [e.y_std_um.hex() for e in found] == [e.y_std_um.hex() for e in bare]
     assert [e.y_dtf_um.hex() for e in found] == [e.y_dtf_um.hex() for e in bare]
+
+
+def test_it_goes_no_further_than_its_limit_and_its_deviation_says_by_how_much_it_would() -> None:
+    free, limited = (started(with_remainder(e, INVERSE)).run(T_Q, AT, CHANNELS) for e in (REMAINDER, LIMITED))
+    wanted = np.array([e.y_effects_um[0] for e in free])
+    beyond = wanted - np.clip(wanted, -3.0, 3.0)
+    assert beyond.min() < -1.0 and beyond.max() > 1.0 and np.mean(beyond == 0.0) > 0.1
+    assert [e.y_effects_um[0] for e in limited] == [float(y) for y in wanted - beyond]
+    assert [e.y_std_um**2 for e in limited] == pytest.approx(
+        [e.y_std_um**2 + b**2 for e, b in zip(free, beyond, strict=True)], rel=1e-9
+    )
+    alone = dataclasses.replace(LIMITED, std_factor=())
+    silent, bare = (started(model).run(T_Q, AT, CHANNELS) for model in (with_remainder(alone, INVERSE), INVERSE))
+    assert [e.y_std_um**2 for e in silent] == pytest.approx(
+        [e.y_std_um**2 + b**2 for e, b in zip(bare, beyond, strict=True)], rel=1e-9
+    )
 
 
 # ---------------------------------------------------------------------------- channels that are missing
@@ -228,9 +252,13 @@ def test_the_model_file_holds_it_to_the_bit_and_says_what_it_is(tmp_path: Path) 
     assert "# The remainder: a regularised linear response of several channels." in dump_model(written)
     silent = dataclasses.replace(REMAINDER, std_factor=())
     assert "std_factor" not in dump_model(with_remainder(silent)) and with_remainder(silent).effects == (silent,)
+    assert "most_um" not in dump_model(written)
+    assert "most_um = 3.0" in dump_model(with_remainder(LIMITED)) and with_remainder(LIMITED).effects == (LIMITED,)
     assert explained.label == "regression of 4 channels"
     for words in ("remainder", "coolant_degc", "0.90 µm rms", "−1.2 to +2.4 µm", "a correction that explains nothing"):
         assert words in explained.explanation
+    limited = LIMITED.explain(Seen(rms_um=0.9, added_um=Range(-1.2, 2.4)))
+    assert limited.endswith("explains nothing, and goes no further than 3.0 µm to either side.")
 
 
 TABLE: dict[str, Any] = {
@@ -265,6 +293,8 @@ TABLE: dict[str, Any] = {
         ({"std_factor": [[1.0, 2.0]]}, "std_factor = (1.0, 2.0) of length 2, expected 4"),
         ({"std_factor": [[0.0] * 4] * (MOST_ROWS + 1)}, "of length 9, expected 0 to 8 rows"),
         ({"std_factor": [["x"]]}, "std_factor = ['x']"),
+        ({"most_um": -1.0}, "most_um = -1.0, expected a number"),
+        ({"most_um": math.inf}, "most_um = inf, expected a number"),
         ({"gain": [1.0]}, "unknown key 'gain'"),
     ],
 )
@@ -301,6 +331,7 @@ def test_the_most_that_is_permitted_runs_and_one_channel_more_is_refused() -> No
         ({"gains": ((1.0, math.inf), (0.0, 0.0))}, "gains = inf, expected finite"),
         ({"std_factor": ((0.0, math.nan, 0.0, 0.0),)}, "std_factor = nan, expected finite"),
         ({"taus_min": (0.0, math.nan)}, "taus_min = nan, expected from 0 to"),
+        ({"most_um": math.nan}, "most_um = nan, expected a number from 0 on"),
     ],
 )
 def test_the_constructor_refuses_what_the_file_would(changes: dict[str, Any], words: str) -> None:

@@ -196,6 +196,31 @@ class FilterBank(Block):
         return np.column_stack([lag.filter(u) for u, row in zip(inputs, self._rows, strict=True) for _, lag in row])
 
 
+class Limit(Block):
+    """A value that goes no further than a limit to either side; the state is by how much it would have.
+
+    Examples
+    --------
+    >>> Limit(2.0).filter(np.array([-3.0, 1.0, NAN, 5.0]))
+    array([-2.,  1., nan,  2.])
+    """
+
+    state = (0.0,)
+
+    def __init__(self, most: float) -> None:
+        self._most = most
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        limited = min(max(u, -self._most), self._most)
+        self.state = (u - limited,)
+        return limited
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the limited record; the state stays as it is."""
+        return np.clip(u, -self._most, self._most)
+
+
 class Delay(Block):
     """A delay of any number of samples, interpolated linearly; the ends of a record hold."""
 

@@ -1,9 +1,10 @@
 """`regression`: the remainder, a regularised linear response of several channels.
 
-y += Σ_c Σ_i gain_ci · L(τ_i) · [f_c(c) − f_c(c at the start)],   f_c(c) = c or c · |c|
+y += limited(Σ_c Σ_i gain_ci · L(τ_i) · [f_c(c) − f_c(c at the start)], most),   f_c(c) = c or c · |c|
 
 It corrects what the channels explain and no named effect does, and explains nothing itself: the search never proposes
-it. With F the low-rank factor of the gains' covariance and φ the outputs of all lags, its variance is Σ_r (F_r · φ)².
+it, and it goes no further than the data showed it to go. With F the low-rank factor of the gains' covariance, φ the
+outputs of all lags and b what lies beyond the limit, its variance is Σ_r (F_r · φ)² + b².
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from compensator.model.effects.base import (
     Effect,
     Run,
     numbers,
+    optional_number,
     optional_rows,
     register,
     rows,
     texts,
 )
-from compensator.model.effects.blocks import Block, ChangeSeen, FilterBank, S, lag_or_none
-from compensator.model.effects.seen import Seen
+from compensator.model.effects.blocks import Block, ChangeSeen, FilterBank, Limit, S, lag_or_none
+from compensator.model.effects.seen import Seen, rounded
 from compensator.model.effects.signals import Signals
 from compensator.model.table import shown
 
@@ -58,7 +60,9 @@ class Regression(BankEffect, Effect):
         For each channel, the gain behind each lag, µm per the channel's unit to the power of its exponent.
     std_factor : tuple of tuple of float
         Rows F_r with the covariance of the gains Σ_r F_r' F_r; in a row as many numbers as there are gains, channel by
-        channel. Empty: the effect states no variance.
+        channel. Empty: they state no variance.
+    most_um : float
+        How far it goes to either side, µm; without a limit by default.
 
     Raises
     ------
@@ -74,6 +78,7 @@ class Regression(BankEffect, Effect):
     taus_min: tuple[float, ...] = numbers(0.0, 1e5)
     gains: tuple[tuple[float, ...], ...] = rows()
     std_factor: tuple[tuple[float, ...], ...] = optional_rows()
+    most_um: float = optional_number(0.0, LARGEST, default=math.inf)
 
     def __post_init__(self) -> None:
         gains = len(self.channels) * len(self.taus_min)
@@ -88,6 +93,7 @@ class Regression(BankEffect, Effect):
             _check_count("std_factor", row, gains, gains, "numbers in a row, one a gain")
         self._check_channels()
         _check_each("taus_min", self.taus_min, lambda tau: 0.0 <= tau <= 1e5, "from 0 to 100000")
+        _check_each("most_um", (self.most_um,), lambda most: most >= 0.0, "a number from 0 on")
         for name, rows_of in (("gains", self.gains), ("std_factor", self.std_factor)):
             for row in rows_of:
                 _check_each(name, row, lambda value: -LARGEST < value < LARGEST, "finite")
@@ -108,11 +114,12 @@ class Regression(BankEffect, Effect):
 
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         changes = [ChangeSeen() for name in self.channels if not _is_of_base(name)]
-        return *changes, FilterBank(self.taus_min, self.gains, period_min, lag=lag_or_none)
+        limits = [Limit(self.most_um)] if self._is_limited else []
+        return *limits, *changes, FilterBank(self.taus_min, self.gains, period_min, lag=lag_or_none)
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         """Return each channel through its curve: as its change from the start, those of the base as they are."""
-        changes = iter(run)
+        changes = iter(run[self._is_limited :])
         found = []
         for name, exponent in zip(self.channels, self.exponents, strict=True):
             u = _signal(signals, name)
@@ -120,16 +127,25 @@ class Regression(BankEffect, Effect):
             found.append(curved if _is_of_base(name) else next(changes)(curved))
         return tuple(found)
 
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
+        added = BankEffect.law(self, signals, run)
+        return run[0](added) if self._is_limited else added
+
+    @property
+    def _is_limited(self) -> bool:
+        return math.isfinite(self.most_um)
+
     @property
     def has_variance(self) -> bool:
-        return bool(self.std_factor)
+        return bool(self.std_factor) or self._is_limited
 
     def variance_um2(self, blocks: Sequence[Block]) -> float:
         bank = blocks[-1]
         assert isinstance(bank, FilterBank)
         outputs = bank.outputs
+        beyond_um = blocks[0].state[0] if self._is_limited else 0.0
         # fsum, because it rounds once: the same bits on every processor, in every version of Python.
-        return math.fsum(math.fsum(map(mul, row, outputs)) ** 2 for row in self.std_factor)
+        return math.fsum(math.fsum(map(mul, row, outputs)) ** 2 for row in self.std_factor) + beyond_um**2
 
     # ------------------------------------------------------------------ contract
 
@@ -154,9 +170,10 @@ class Regression(BankEffect, Effect):
     def explain(self, seen: Seen) -> str:
         names = list(dict.fromkeys(self.channels))
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        limit = f", and goes no further than {rounded(self.most_um)} µm to either side" if self._is_limited else ""
         return (
             f"{seen.words}: the remainder, a regularised linear response of {', '.join(names[:_NAMED])}{more}. It is a "
-            "correction that explains nothing."
+            f"correction that explains nothing{limit}."
         )
 
     def to_table(self) -> dict[str, Any]:
