@@ -268,7 +268,9 @@ def _extended(
         remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
     if remainder is not None:
         seen = seen_of(remainder, found.whole - found.named, evidence)
-        remainder = no_further_than_seen(remainder, evidence)
+        if not found.refitted:
+            # Paths that were fitted anew together with it may go further, too, and the two share what both explain.
+            remainder = no_further_than_seen(remainder, evidence)
         deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(seen)))
     if not deployed and base is model:
         return model, ()

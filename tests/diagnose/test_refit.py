@@ -142,6 +142,16 @@ def test_paths_that_held_out_blocks_contradict_are_not_deployed(
 
 
 @pytest.mark.usefixtures("found")
+def test_beside_paths_that_were_fitted_anew_the_remainder_has_no_limit(model, searches):
+    searched = searches["findings_of"][0]
+    searched = dataclasses.replace(searched, remainder=searched.channels)
+    for refitted, is_limited in ((searched.refitted, False), (None, True)):
+        extended, _ = diagnosis_module._extended(model, dataclasses.replace(searched, refitted=refitted), ())
+        (rest,) = extended.effects
+        assert rest.kind == "regression" and np.isfinite(rest.most_um) == is_limited
+
+
+@pytest.mark.usefixtures("found")
 def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, searches, monkeypatch):
     """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
     real, asked = diagnosis_module.findings_of, []
