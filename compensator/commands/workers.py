@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 from compensator import __version__
+from compensator.blas import in_one_thread
 from compensator.errors import ServiceError, UsageError
+from compensator.progress import Progress
 
 #: Time to wait for a scheduler, s.
 SCHEDULER_S = 10.0
@@ -49,6 +52,25 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def in_parallel(jobs: Sequence[Callable[[], Any]], progress: Progress) -> list[Any]:
+    """Do independent jobs, one process for each as far as there are cores, and return their results in order.
+
+    Parameters
+    ----------
+    jobs : sequence of callable
+        Without arguments; like their results they can be pickled. The longest first.
+    progress : callable
+        Called with how many jobs of how many are done.
+    """
+    results: list[Any] = []
+    with workers(len(jobs), None) as executor:
+        pending = [executor.submit(in_one_thread, job) for job in jobs] if executor else jobs
+        for one in pending:
+            progress(len(results), len(jobs))
+            results.append(one.result() if isinstance(one, Future) else in_one_thread(one))
+    return results
 
 
 @contextmanager

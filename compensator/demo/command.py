@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_page, pages_text
+from compensator.commands.progress import progress_bar
+from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import calibrate, paper_case
 from compensator.demo.day import run_day
 from compensator.demo.figures import shop_day, shown, table_of
 from compensator.demo.live import run_live
-from compensator.demo.loop import FIRST_MODEL, SECOND_DAY, Loop, close_the_loop
+from compensator.demo.loop import FIRST_MODEL, SECOND_DAY, close_the_loop, effect_of, figures_of_loop, second_day
 from compensator.demo.machine import MACHINES
 from compensator.demo.shop import run_shop_day
 from compensator.demo.ten_days import results, ten_days
-from compensator.report.demonstration import closed, page_of, verdict
+from compensator.report.demonstration import MachineDay, closed, page_of, verdict
 from compensator.report.formats import write
-from compensator.report.shop import ShopDay, probe_words, shop_table
+from compensator.report.shop import probe_words, shop_table
 from compensator.report.ten_days import days_page, days_table, days_verdict
 
 
@@ -79,18 +82,26 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     (dict, str)
         Figures, and the table as text.
     """
-    days = []
-    for name in MACHINES:
-        calibrate(out / name, machine=name, seed=seed)
-        day = run_day(out / name, machine=name, hours=hours, seed=seed, model="calibration/model.toml")
-        days.append(shown(name, day))
+    machine, days_of = out / "conduction", partial(_day_of_machine, out, hours=hours, seed=seed)
+    shop = partial(run_shop_day, machine="conduction", model=FIRST_MODEL, effects=[effect_of(seed, hours)])
+    with progress_bar("two simulated machines") as progress:
+        for name in MACHINES:
+            calibrate(out / name, machine=name, seed=seed)
+        # Each day has devices, service and receiver of its own.
+        jobs: list[Callable[[], Any]] = [
+            partial(close_the_loop, machine, hours=hours, seed=seed),
+            partial(shop, machine / "shop", hours=hours, seed=seed + SECOND_DAY),
+            partial(second_day, machine, "first", hours=hours, seed=seed),
+            *(partial(days_of, name) for name in MACHINES),
+            partial(paper_case, out / "paper", seed=seed),
+        ]
+        adopted, (probed, sent), first, *days, paper = in_parallel(jobs, progress)
     results = {day.name: day.figures for day in days}
-    page = out / "report.html"
     table = table_of(results)
-    closed_loop = close_the_loop(out / "conduction", hours=hours, seed=seed)
-    loop = closed_loop.figures
-    shop = _shop(out / "conduction", closed_loop, hours=hours, seed=seed)
-    made = page_of(days, table, loop, closed_loop.second_day, shop, paper_case(out / "paper", seed=seed))
+    loop, curves = figures_of_loop(adopted, first, effect_of(seed, hours))
+    shopped = shop_day(first, probed, sent)
+    page = out / "report.html"
+    made = page_of(days, table, loop, curves, shopped, paper)
     for path in filter(None, (page, also)):
         write(path, made)
     summary = (
@@ -98,8 +109,10 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
         f"the first day: {', '.join(loop['found']) or 'nothing'}.\n"
         f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
-    result = {"machines": results, "loop": loop, "shop": shop.figures, "report": str(page)}
-    tables = f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shop).text()}\n\n{probe_words(shop).text()}"
+    result = {"machines": results, "loop": loop, "shop": shopped.figures, "report": str(page)}
+    tables = (
+        f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shopped).text()}\n\n{probe_words(shopped).text()}"
+    )
     return result, f"{tables}\n{pages_text(page, also)}"
 
 
@@ -113,14 +126,6 @@ def run_ten_days(out: Path, *, seed: int, also: Path | None = None) -> tuple[dic
     return {"loop_days": results(days), "report": str(page)}, text
 
 
-def _shop(folder: Path, loop: Loop, *, hours: float, seed: int) -> ShopDay:
-    """Run the second day of the loop as a shop would, with the effect and the first model."""
-    day, sent = run_shop_day(
-        folder / "shop",
-        machine="conduction",
-        hours=hours,
-        seed=seed + SECOND_DAY,
-        model=FIRST_MODEL,
-        effects=[loop.effect],
-    )
-    return shop_day(loop.first_model, day, sent)
+def _day_of_machine(out: Path, name: str, *, hours: float, seed: int) -> MachineDay:
+    """Run a day of a machine without an effect."""
+    return shown(name, run_day(out / name, machine=name, hours=hours, seed=seed, model="calibration/model.toml"))

@@ -9,7 +9,6 @@ import asyncio
 import json
 import shutil
 import socket
-import sys
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,8 +17,6 @@ from typing import Any
 
 import msgspec
 import zenoh
-from rich.console import Console
-from rich.progress import Progress
 
 from compensator.arrays import Vector
 from compensator.clock import NS, VirtualClock
@@ -167,15 +164,7 @@ def run_day(
                     await asyncio.sleep(ADOPT_PATIENCE_S)
 
         clock = VirtualClock(START_NS, advance)
-        samples = round(hours * 60)
-        with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-            bar = progress.add_task(f"simulated machine {machine}", total=samples)
-
-            def append(outcome: Outcome) -> None:
-                running.outcomes.append(outcome)
-                progress.advance(bar)
-
-            asyncio.run(_serve(config, clock, samples, append, running.received, port))
+        asyncio.run(_serve(config, clock, round(hours * 60), running.outcomes.append, running.received, port))
     return Day(
         outcomes=running.outcomes,
         received=running.received.offsets,

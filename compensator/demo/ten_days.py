@@ -18,10 +18,9 @@ import numpy as np
 
 from compensator.api.loop import diagnosis_in_process
 from compensator.arrays import Vector
-from compensator.blas import in_one_thread
 from compensator.clock import NS
 from compensator.commands.progress import progress_bar
-from compensator.commands.workers import workers
+from compensator.commands.workers import in_parallel
 from compensator.config import Channel, Config, Loop, parse_config
 from compensator.demo.calibration import PERIOD_S, calibrate
 from compensator.demo.day import START_NS
@@ -72,17 +71,9 @@ def ten_days(out: Path, *, seed: int) -> list[MachineDays]:
     seed : int
         Seed of duties, sensors and probes.
     """
-    job = partial(machine_days, out, seed=seed)
-    names = ("sensor", "probes")
-    with progress_bar("ten days of two machines") as progress, workers(len(names), None) as executor:
-        if executor is None:
-            return [in_one_thread(job, name) for name in names]
-        jobs = [executor.submit(in_one_thread, job, name) for name in names]
-        found = []
-        for i, one in enumerate(jobs):
-            progress(i, len(jobs))
-            found.append(one.result())
-        return found
+    jobs = [partial(machine_days, out, name, seed=seed) for name in ("sensor", "probes")]
+    with progress_bar("ten days of two machines") as progress:
+        return in_parallel(jobs, progress)
 
 
 def machine_days(out: Path, name: str, *, seed: int) -> MachineDays:

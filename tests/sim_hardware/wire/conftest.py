@@ -79,7 +79,8 @@ def rack() -> Iterator[Rack]:
     with Rack() as running:
         yield running
     assert threading.active_count() <= threads
-    assert _open_files() == files
+    # What an earlier test left open may be collected meanwhile.
+    assert _open_files() <= files
 
 
 @pytest.fixture
