@@ -498,7 +498,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 1 failed."""
     given = _parser().parse_args(argv)
     # A script starts its background jobs with SIGINT ignored, and so would pip be started.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     os.umask(0o022)  # root's own may be narrower, and then the service could not read its program
     installation, system = Installation(given.prefix, given.destdir), System(touch=not given.destdir)
     try:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -242,9 +243,15 @@ def combine(
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
     series = _Series(files, signed, newest)
     read = [file for file in files if file.is_recording]
-    for before, after in zip([None, *read[:-1]], read, strict=True):
-        series.check_file(after)
-        series.check_link(before if before is not None and before.machine == after.machine else None, after)
+    for _, of_machine in groupby(read, key=lambda file: file.machine):
+        before, between = None, list[RecordingAudit]()
+        for after in of_machine:
+            series.check_file(after)
+            if after.last:
+                series.check_link(before, between, after)
+                before, between = after, []
+            else:
+                between.append(after)
     if read and newest:
         series.check_head(read, newest, heads)
     if not any(file.samples or file.last for file in files):
@@ -366,16 +373,20 @@ class _Series:
             if not file.findings_count and not self.own[file.file].findings_count:
                 self._find(Fault.NOTHING_PROVEN, file, size=file.size)
 
-    def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
-        """Check the link of a file to the previous one."""
-        if not after.last:
-            return
-        if before is None:
-            self._check_first(after)
-        elif not before.last:
-            began = before.end in (RecordingEnd.OPEN, RecordingEnd.TORN) and after.previous_file == before.file
+    def check_link(
+        self, before: RecordingAudit | None, between: Sequence[RecordingAudit], after: RecordingAudit
+    ) -> None:
+        """Check the link of a file with a chain to the previous one that has one, over files without between them."""
+        named = next((file for file in between if file.original == after.previous_file), None)
+        if named is not None:
+            began = named.end in (RecordingEnd.OPEN, RecordingEnd.TORN)
             if began and after.previous != NOTHING.hex():
-                self._find(Fault.MORE_WAS_THERE, before, next=after.file)
+                self._find(Fault.MORE_WAS_THERE, named, next=after.file)
+            elif began and before is not None:
+                figures = f"{after.file}: starts a new chain; it states that {named.file} held no record"
+                self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, f"{figures}."))
+        elif before is None:
+            self._check_first(after)
         elif after.previous == before.last:
             self._check_state(before, after)
         elif not after.previous_file:

@@ -58,7 +58,8 @@ class AxesReceiver(Client):
     ) -> None:
         source = settings.source
         # One subscription for all axes keeps the order in which they were published.
-        super().__init__(source, "*/offset", clock=clock, utc_ns=utc_ns)
+        latest = tuple(f"{axis}/offset" for axis in settings.axes)
+        super().__init__(source, "*/offset", latest, clock=clock, utc_ns=utc_ns)
         self._records = _records(settings)
         self._signs = {axis: limits.sign for axis, limits in settings.linear.items()}
         self.follower = AxesFollower(
@@ -79,7 +80,9 @@ class AxesReceiver(Client):
         return self.follower
 
     def poll(self, control: ControlState = NOTHING_READ) -> AppliedAxes:
-        """Process new messages, advance in time, and return the offsets to apply; never waits.
+        """Process new messages, advance in time, and return the offsets to apply.
+
+        It waits for no message; with `state_file` it waits for the disk after each sample that is accepted.
 
         Parameters
         ----------

@@ -90,7 +90,10 @@ class Client(ABC):
     source : Source
         Machine and addresses.
     offset_key : str
-        Below the prefix and `thermal/`.
+        What is subscribed to, below the prefix and `thermal/`.
+    latest_keys : tuple of str
+        What the latest offset is asked for by: no patterns, because a stranger may answer one with thousands of keys,
+        and Zenoh's thread waits for what an answer's buffer does not hold.
     clock, utc_ns : callable
         Monotonic clock, s, and wall clock, ns.
 
@@ -101,12 +104,18 @@ class Client(ABC):
     """
 
     def __init__(
-        self, source: Source, offset_key: str, *, clock: Callable[[], float], utc_ns: Callable[[], int]
+        self,
+        source: Source,
+        offset_key: str,
+        latest_keys: tuple[str, ...],
+        *,
+        clock: Callable[[], float],
+        utc_ns: Callable[[], int],
     ) -> None:
         self._source = source
         self._config = client_config(source)
         self._clock, self._utc_ns = clock, utc_ns
-        self._offset_key = offset_key
+        self._offset_key, self._latest_keys = offset_key, latest_keys
         self._state_file = Path(source.state_file) if source.state_file else None
         self._remark: Reason | None = None
         self._record_remark: Reason | None = None
@@ -266,22 +275,23 @@ class Client(ABC):
         self._query_latest()
 
     def _query_latest(self) -> None:
-        if len(self._answers) < _BUFFER:
-            # A ring channel would lose the answers when the query ends.
-            handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
-            self._answers.append(self._session.get(self._key(self._offset_key), handler, timeout=ANSWER_TIMEOUT_S))
-        if len(self._status_answers) < _BUFFER:
-            handler = zenoh.handlers.FifoChannel(_BUFFER)
-            self._status_answers.append(self._session.get(self._key("status"), handler, timeout=ANSWER_TIMEOUT_S))
+        keys = [*((key, self._answers) for key in self._latest_keys), ("status", self._status_answers)]
+        for key, answers in keys:
+            if len(answers) < _BUFFER:
+                # A ring channel would lose the answers when the query ends.
+                handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
+                answers.append(self._session.get(self._key(key), handler, timeout=ANSWER_TIMEOUT_S))
 
     # ------------------------------------------------------------------ over a restart
 
     def _last_sequence(self) -> int:
-        if self._state_file is None or not self._state_file.exists():
+        if self._state_file is None:
             return -1
         try:
             kept = json.loads(read_file(self._state_file, STATE_MAX_BYTES))
             machine, last = kept["machine"], kept["last_sequence"]
+        except FileNotFoundError:
+            return -1
         except (OSError, ValueError, TypeError, KeyError, RecursionError):
             machine, last = None, None
         if not isinstance(last, int) or isinstance(last, bool) or not -1 <= last <= SEQ_MAX:
@@ -299,12 +309,12 @@ class Client(ABC):
         accepted, self._accepted = self._accepted, False
         if self._state_file is None or not accepted:
             return
-        part = self._state_file.with_name(self._state_file.name + ".part")
         try:
+            part = self._state_file.with_name(self._state_file.name + ".part")
             write_file(part, json.dumps(self._modes.snapshot()))
             part.replace(self._state_file)
-        except OSError as error:
-            self._remark = Reason("state_not_saved", f"{self._state_file}: {error.strerror or error}")
+        except (OSError, ValueError) as error:  # ValueError: "/" has no name
+            self._remark = Reason("state_not_saved", f"{self._state_file}: {getattr(error, 'strerror', None) or error}")
         else:
             self._remark = None
 

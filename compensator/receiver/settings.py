@@ -23,6 +23,10 @@ _LARGEST = 1e30
 SETTINGS_MAX_BYTES, ZENOH_MAX_BYTES, STATE_MAX_BYTES = 1_000_000, 1_000_000, 10_000
 #: Most opening brackets in a configuration file of Zenoh: its parser ends the process if some 28,000 are nested.
 ZENOH_BRACKETS = 15_000
+#: Deepest key of a settings file; the time to read one grows with the square of it.
+KEY_PARTS = 32
+_PART = rb"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d}" % KEY_PARTS)
 _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
 
@@ -198,7 +202,10 @@ def write_file(path: Path, text: str, *, append: bool = False) -> None:
         If it cannot be written, or is a device, a pipe or a folder.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe would wait for its reader
-    descriptor = os.open(path, flags | (os.O_APPEND if append else os.O_TRUNC), 0o666)
+    try:
+        descriptor = os.open(path, flags | (os.O_APPEND if append else os.O_TRUNC), 0o666)
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "no name of a file") from error
     with open(descriptor, "w", encoding="utf-8") as file:  # noqa: PTH123  a descriptor
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(errno.EINVAL, "not a regular file")
@@ -225,7 +232,10 @@ def load_tables(path: Path) -> dict[str, Any]:
         If it cannot be read.
     """
     try:
-        return tomllib.loads(read_file(path, SETTINGS_MAX_BYTES).decode("utf-8"))
+        data = read_file(path, SETTINGS_MAX_BYTES)
+        if _DEEP_KEY.search(data):
+            raise ReceiverError(f"{path}: a key of more than {KEY_PARTS} parts")
+        return tomllib.loads(data.decode("utf-8"))
     except OSError as error:
         raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or an integer of thousands of digits
@@ -321,6 +331,6 @@ def _value(value: Any, kind: str, where: str) -> Any:
         return float(value)
     if (kind == "int" and number and isinstance(value, int)) or (kind == "bool" and isinstance(value, bool)):
         return value
-    if kind == "str" and isinstance(value, str):
+    if kind == "str" and isinstance(value, str) and "\0" not in value:
         return value
     raise ReceiverError(f"{where} = {repr(value)[:60]}: expected {_EXPECTED[kind]}")

@@ -55,7 +55,7 @@ class Receiver(Client):
         clock: Callable[[], float] = monotonic_s,
         utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        super().__init__(settings, "y/offset", clock=clock, utc_ns=utc_ns)
+        super().__init__(settings, "y/offset", ("y/offset",), clock=clock, utc_ns=utc_ns)
         self._record = AppliedRecord(Path(settings.applied_file)) if settings.applied_file else None
         self.follower = Follower(
             settings.machine, settings.limits(step_max_s=step_max_s), applied_um, self._last_sequence()
@@ -66,7 +66,10 @@ class Receiver(Client):
         return self.follower
 
     def poll(self) -> Applied:
-        """Process new messages, advance in time, and return the offset to apply; never waits."""
+        """Process new messages, advance in time, and return the offset to apply.
+
+        It waits for no message; with `state_file` it waits for the disk after each one that is accepted.
+        """
         applied = self.follower.advance(self._receive_all())
         return replace(applied, reasons=applied.reasons + self._remarks)
 

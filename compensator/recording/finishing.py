@@ -14,16 +14,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from mcap.writer import Writer
 
 from compensator.clock import NS
 from compensator.codes import RecordingEnd
 from compensator.errors import DataError
 from compensator.events import RecordingCode, RecordingData
-from compensator.messages import encode
+from compensator.messages import UNREADABLE, Seal, encode
 from compensator.recording import chain
 from compensator.recording.compaction import Copy, rewrite
-from compensator.recording.container import Contents, Message
+from compensator.recording.container import PAYLOAD, Contents, Message
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
@@ -253,7 +254,8 @@ class _ChainedCopy(Copy):
         self.unsigned = False
         self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
-        self._sealed = False
+        #: Whether the last record is the seal of an end, which one of an hour is not, and whether the chain lists it.
+        self._sealed = self._ended = False
         #: Records that were not yet in the chain; None if the file was complete.
         self.recovered: int | None = None
 
@@ -270,17 +272,19 @@ class _ChainedCopy(Copy):
             self._chain.listed()
         else:
             self._chain.add(topic, message.body)
-        self._sealed = topic == "seal" or (self._sealed and topic == "chain")
+        self._ended = self._sealed and topic == "chain"
+        self._sealed = self._ended or (topic == "seal" and not _is_of_hour(message))
         self._last = message
 
     def finish(self) -> None:
         """Finish a torn end, and write the end of the file."""
         if self._chain is None or self._last is None:
             raise DataError("no complete record, expected at least one")
-        if not self._sealed:
+        if not self._ended:
             self.recovered = len(self._chain.links)
             if self.recovered:
                 self._append("chain", self._chain.message(self._last.log_time_ns))
+        if not self._ended:
             time_ns, sequence = self._last.log_time_ns, self._last.sequence
             seal = chain.seal(self._chain.machine, time_ns, RecordingEnd.RECOVERED, sequence, self._chain.head)
             signer = self._signer if seal.sha256 in self._accepted else None
@@ -295,3 +299,11 @@ class _ChainedCopy(Copy):
         channel = next(number for number, name in self.topics.items() if name == topic)
         sequence, time_ns = self._last.sequence + 1, self._last.log_time_ns
         self.add(Message(channel, sequence, time_ns, chain.body_of(sequence, time_ns, data)))
+
+
+def _is_of_hour(message: Message) -> bool:
+    """Return whether a seal is one of those within a file."""
+    try:
+        return msgspec.json.decode(message.body[PAYLOAD:], type=Seal).reason == "hour"
+    except UNREADABLE:
+        return False

@@ -9,7 +9,6 @@ adds, of which a kill may leave any number.
 from __future__ import annotations
 
 import os
-import stat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.errors import DataError, UsageError
+from compensator.input_file import read_file
 from compensator.messages import UNREADABLE
 from compensator.recording.reading import last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
@@ -152,17 +152,10 @@ def read_head(path: Path, verifier: Verifier | None = None) -> Head:
         If it cannot be read, is no head, or is not signed with the key.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with os.fdopen(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise UsageError(f"{path}: not a regular file, expected the head of a chain")
-            data = file.read(LONGEST + 1)
+        data = read_file(path, LONGEST)
     except (OSError, ValueError) as error:
-        raise UsageError(
-            f"{path}: {getattr(error, 'strerror', None) or error}; expected the head of a chain"
-        ) from error
-    if len(data) > LONGEST:
-        raise UsageError(f"{path}: more than {LONGEST} bytes, expected the head of a chain")
+        why = getattr(error, "strerror", None) or error
+        raise UsageError(f"{path}: {why}; expected the head of a chain") from error
     try:
         head = msgspec.json.decode(data, type=Head)
         for end in head.ends:
@@ -209,14 +202,15 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
         The head.
     """
     there = recordings(folder, machine)
-    newest = there[-1] if there else None
+    # A kill before the first sync leaves a file without a record, which nothing continues.
+    newest = next((path for path in reversed(there) if not _is_empty(path)), there[-1] if there else None)
     for end in reversed(keeper.ends if keeper is not None else ()):
         path = folder / end.file
         if not path.exists():
             if not end.synced:  # a kill before its first sync
                 continue
             return Previous(end.file, bytes.fromhex(end.synced), "is missing")
-        if newest is not None and newest.name != end.file:
+        if newest is not None and newest.stem > path.stem:
             return Previous(newest.name, _value(newest), f"is newer than {end.file}, the last recording of the head")
         values = values_of(path)
         if not values:
@@ -230,6 +224,14 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
             return Previous(end.file, last, "goes on after the head")
         return Previous(end.file, bytes.fromhex(end.synced), "does not contain the head: it was cut off or rewritten")
     return Previous(newest.name, _value(newest)) if newest is not None else Previous("", b"")
+
+
+def _is_empty(path: Path) -> bool:
+    """Return whether a recording ends before its first record; one that cannot be read is not empty."""
+    try:
+        return path.stat().st_size == 0 or not last_value(path)
+    except (DataError, OSError):
+        return False
 
 
 def _value(path: Path) -> bytes:

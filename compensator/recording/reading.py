@@ -15,6 +15,9 @@ from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
 
+#: Most bytes and records of a group: what one sample writes is a thousandth of that, a model that is adopted a tenth.
+GROUP_BYTES, GROUP_RECORDS = 16_000_000, 10_000
+
 _T = TypeVar("_T")
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
 _DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in ALL_MESSAGES.items()}
@@ -102,10 +105,13 @@ def groups_of(container: Container) -> Iterator[Group]:
         If it cannot be read any further; everything before that was yielded.
     """
     records: list[RawRecord] = []
-    end = ""
+    end, size = "", 0
     try:
         for record in records_of(container):
             topic = record.topic
+            size = size + len(record.body) if records else len(record.body)
+            if size > GROUP_BYTES or len(records) > GROUP_RECORDS:
+                raise Damaged(container.path, container.position, "a group of records that is too long")
             if not end:
                 topics = {channel.topic for channel in container.contents.channels.values()}
                 end = "chain" if "/chain" in topics else "offset"

@@ -6,8 +6,9 @@ import sys
 
 import zenoh
 
-signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C and SIGTERM end it, also in the background of a script
-signal.signal(signal.SIGTERM, signal.SIG_DFL)
+for number in (signal.SIGINT, signal.SIGTERM):  # they end it, also in the background of a script
+    signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [number])
 given = dict(enumerate(sys.argv))
 endpoint, prefix = given.get(1, "tcp/127.0.0.1:7447"), given.get(2, "shop/vmc-07")
 connect = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}

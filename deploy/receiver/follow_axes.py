@@ -18,10 +18,10 @@ def apply(applied: AppliedAxes) -> None:
 
 
 ending = (signal.SIGINT, signal.SIGTERM)
-signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)  # whoever starts it may have blocked or ignored them
 for number in ending:
     signal.signal(number, signal.default_int_handler)
 try:
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)  # whoever starts it may have blocked or ignored them
     settings, _ = load_any(sys.argv[1] if len(sys.argv) > 1 else "receiver_axes.toml")
     if not isinstance(settings, AxesSettings):
         sys.exit("follow_axes.py: expected a table such as [axis.z]; of Y alone: follow.py")

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from compensator.audit.series import Audit, audit, summary
+from compensator.audit.result import RecordingAudit
+from compensator.audit.series import Audit, audit, combine, summary
+from compensator.codes import RecordingEnd
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
+from compensator.recording.chain import NOTHING
+from compensator.recording.container import Container, Damaged
+from compensator.recording.finishing import compact
 from compensator.recording.head import LONGEST, read_head
-from compensator.recording.reading import first_sequence, recordings
+from compensator.recording.reading import first_sequence, recordings, records_of, values_of
 from compensator.recording.signature import Signer, Verifier
 from compensator.service.loading import head_file
 from tests.audit.attacks import edited_offset, rechained, rechained_all, unsigned_seals, without_seals
@@ -322,3 +328,87 @@ def test_what_lies_behind_the_head_is_counted_from_it(shop: Shop) -> None:
     without, (behind,) = shop.audit().files[0], shop.audit(head=True).files
     assert (without.unsigned_samples, without.unsigned_min) == (19, 19.0)
     assert (behind.unsigned_samples, behind.unsigned_min) == (1, 1.0)
+
+
+# ------------------------------------------------------------------ files without a record, and kills at a seal
+
+
+@pytest.mark.parametrize("removed", [slice(1, 2), slice(1, 4), slice(0, 2)])
+@pytest.mark.parametrize("place", [0, 1])
+def test_an_empty_file_between_two_does_not_hide_what_was_removed(shop: Shop, removed: slice, place: int) -> None:
+    for i in range(5):
+        shop.start(20 * i).run(20).stop()
+    files = shop.files
+    assert shop.audit(head=True).clean
+    for path in files[removed]:
+        path.unlink()
+    without = shop.audit(head=True)
+    # By its name it stands where the removed ones were, or right after the first of those that are left.
+    decoy = files[removed][0] if place else files[removed][-1]
+    decoy.with_name(decoy.stem.replace("Z", "Z-001") + ".mcap").touch()
+    found = shop.audit(head=True)
+    assert kinds(found) == kinds(without)
+    of_decoy = ("torn", "not_worked_out")
+    assert [r.code for r in without.remarks] == [r.code for r in found.remarks if r.code not in of_decoy]
+    assert found.clean is (removed.start == 0)
+
+
+@pytest.mark.parametrize("headless", [False, True])
+def test_an_honest_file_without_a_record_is_passed_over(tmp_path: Path, headless: bool) -> None:
+    """A kill before the first sync leaves one; without a head, too, the chain goes on from the file before."""
+    (tmp_path / "shop").mkdir()
+    shop = Shop(tmp_path / "shop", headless=headless)
+    shop.start().run(20).stop()
+    (shop.rec / f"{MACHINE}_20260105T230000Z.mcap").touch()
+    shop.start(1100).run(20).stop()
+    first, empty, _ = shop.files
+    assert empty.stat().st_size == 0 and shop.audit().clean
+    first.unlink()
+    assert f"continues {first.name}, which was not given" in " ".join(shop.audit().remarks)
+
+
+def test_a_later_file_that_states_that_one_before_it_was_empty_is_told_as_such() -> None:
+    """As services without a head left it until now."""
+    first = RecordingAudit(file="vmc-07_20260105T060000Z.mcap", original="vmc-07_20260105T060000Z.mcap")
+    first.machine, first.last, first.previous = MACHINE, "11" * 32, NOTHING.hex()
+    empty = RecordingAudit(file="vmc-07_20260105T070000Z.mcap", original="vmc-07_20260105T070000Z.mcap")
+    empty.machine, empty.end = MACHINE, RecordingEnd.TORN
+    last = replace(first, file="vmc-07_20260105T080000Z.mcap", original="vmc-07_20260105T080000Z.mcap")
+    last.last, last.previous_file = "22" * 32, empty.file
+    found = combine([first, empty, last])
+    assert found.clean and "held no record" in " ".join(found.remarks)
+    last.previous = "33" * 32
+    assert kinds(combine([first, empty, last])) == {"truncated"}
+
+
+@pytest.mark.parametrize("minutes", [60, 61, 62])
+def test_a_kill_after_the_seal_of_an_hour_leaves_a_whole_recording(shop: Shop, minutes: int) -> None:
+    shop.start().run(minutes).kill()
+    shop.start(minutes).run(5).stop()
+    found = shop.audit(head=True)
+    assert found.clean, summary(found)
+    assert [file.end for file in found.files] == [RecordingEnd.RECOVERED, RecordingEnd.FINISHED]
+
+
+@pytest.mark.parametrize("is_end", [False, True], ids=["hour", "stop"])
+def test_a_write_that_was_torn_between_a_seal_and_its_place_in_the_chain(shop: Shop, is_end: bool) -> None:
+    service = shop.start().run(61)
+    live = service.recorder._live
+    if is_end and live is not None:
+        live.seal("stop", service.now_ns, shop.signer)
+        live.sync()
+    service.kill()
+    shop.files[0].write_bytes(_up_to_last_seal(shop.files[0]))
+    compact(shop.files[0], shop.signer, accepted=frozenset(value.hex() for value in values_of(shop.files[0])))
+    found = shop.audit()
+    assert found.clean, summary(found)
+
+
+def _up_to_last_seal(path: Path) -> bytes:
+    """The bytes of a live recording up to the last seal, without the message of the chain that lists it."""
+    end = 0
+    with Container(path) as container, suppress(Damaged):
+        for record in records_of(container):
+            if record.topic == "seal":
+                end = container.position
+    return path.read_bytes()[:end]

@@ -97,7 +97,7 @@ def test_ends_when_started_with_the_signals_ignored_and_blocked(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("name", ["receiver", "follow.py", "router", "watch"])
+@pytest.mark.parametrize("name", PROGRAMS)
 def test_a_signal_that_waited_for_the_program_to_start_ends_it(
     tmp_path: Path, name: str, number: signal.Signals
 ) -> None:
