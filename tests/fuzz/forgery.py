@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,8 +25,8 @@ from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.audit.test_signatures import write_key
 from tests.fuzz.mutation import mutated
 
-#: Minutes that the recorded service ran each time; it was stopped, killed, and killed again.
-RUNS = (65, 20, 70)
+#: Minutes that the recorded service ran each time; it was stopped, and then killed, once right after an hourly seal.
+RUNS = (65, 20, 61, 70)
 _NONE_LEFT = "no file is left"
 
 
@@ -212,6 +212,12 @@ def _inserted(rng: random.Random, paths: list[Path]) -> None:
         rechained(copy, rng.choice((without_seals, unsigned_seals)), before=last_value(paths[-1]))
 
 
+def _emptied(rng: random.Random, paths: list[Path]) -> None:
+    """Put a file without a record where one is or was, as a kill before its first sync leaves one."""
+    path = rng.choice(paths)
+    path.with_name(path.name.replace("Z", f"Z-{rng.randrange(1, 9):03d}", 1)).touch()
+
+
 ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
     "rewritten": _rewritten,
     "rewritten again": _rewritten,
@@ -219,12 +225,13 @@ ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
     "removed": _removed,
     "exchanged": _exchanged,
     "inserted": _inserted,
+    "emptied": _emptied,
 }
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What came of one attack: its kind, whether it was found, and about which record somebody was deceived."""
+    """What came of one or two attacks: their kinds, whether they were found, and about what somebody was deceived."""
 
     kind: str
     found: bool
@@ -246,9 +253,15 @@ def attacked(originals: Originals, folder: Path, seed: int) -> Tried:
     rng = random.Random(seed)
     shutil.copytree(originals.folder / "rec", folder / "rec")
     shutil.copy(originals.folder / "vmc-07.head.json", folder)
-    kind = rng.choice(list(ATTACKS))
-    ATTACKS[kind](rng, recordings(folder / "rec", MACHINE))
-    found = []
+    kinds = rng.sample(list(ATTACKS), 2 if rng.random() < 0.5 else 1)
+    # What is read by an attack must hold records.
+    kinds.sort(key=lambda kind: kind == "emptied")
+    for i, one in enumerate(kinds):
+        paths = recordings(folder / "rec", MACHINE)
+        if i == 0 or len(paths) > 1:
+            with suppress(DataError) if i else nullcontext():
+                ATTACKS[one](rng, paths)
+    kind, found = " + ".join(kinds), list[bool]()
     for head in (False, True):
         verdict = _verdict(originals, folder, head=head)
         found.append(verdict is None or not verdict.clean)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import random
 import re
@@ -18,12 +19,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from mcap.writer import CompressionType, Writer
+
 from compensator.cli import main
 from compensator.config import Config, parse_config
 from compensator.errors import CompensatorError
 from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.receiver import Receiver, ReceiverError, load_settings
 from compensator.service.transfer.model_store import check_model
-from tests.audit.made import CONFIG
+from tests.audit.made import CONFIG, Service
 from tests.fuzz.attacked_receiver import Attack
 from tests.fuzz.mutation import mutated
 from tests.fuzz.payloads import number
@@ -34,6 +38,14 @@ QUILL = read_model_bytes("quill")
 TABLE = b"t_s,t_q_degc,at_degc,y_um,heat_w\n" + b"".join(
     f"{60 * i},{20 + 0.01 * i:.2f},20.1,{0.02 * i:.3f},{30 if i > 20 else 0}\n".encode() for i in range(150)
 )
+RECEIVER = b"""[receiver]
+machine = "vmc-07"
+prefix = "shop/vmc-07"
+connect = ["tcp/127.0.0.1:1"]
+offset_max_um = 100.0
+offset_rate_max_um_per_min = 6.0
+check_clock = true
+"""
 #: Numbers that TOML can hold and no machine has.
 _NUMBERS = (
     "inf",
@@ -175,6 +187,78 @@ def no_file(rng: random.Random, folder: Path) -> None:
     )
 
 
+def recording(rng: random.Random, folder: Path) -> None:
+    """A recording is audited or refused; whatever it says of itself, it costs no memory."""
+    path = folder / f"vmc-07_20260105T060000Z{rng.choice(('', '-001'))}.mcap"
+    if rng.randrange(3) and len(_RECORDED) == 0:
+        _RECORDED.append(_recorded(folder))
+    if rng.randrange(3) and _RECORDED:
+        path.write_bytes(mutated(rng.randrange(2**32), _RECORDED[0]))
+    else:
+        path.write_bytes(_without_end(rng))
+    with little_memory():
+        command(folder, "replay", path.name)
+        command(folder, "export", path.name, "--out", "out.csv")
+
+
+_RECORDED: list[bytes] = []
+
+
+def _recorded(folder: Path) -> bytes:
+    """The bytes of a recording of an hour."""
+    Service(folder / "made").run(60).stop()
+    (path,) = (folder / "made").glob("*.mcap")
+    return path.read_bytes()
+
+
+def _without_end(rng: random.Random) -> bytes:
+    """A recording of some kilobytes whose only group never ends: messages of zeros."""
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=1000, compression=CompressionType.ZSTD)
+    writer.start()
+    schema = writer.register_schema("s", "jsonschema", b"{}")
+    topics = [f"/{name}" for name in ("sample", "estimate", "offset", "event", "chain")]
+    channels = [writer.register_channel(topic, "json", schema) for topic in topics]
+    data = bytes(int(10 ** rng.uniform(0, 6.9)))
+    for i in range(int(10 ** rng.uniform(0, min(3.0, 8.8 - math.log10(len(data) + 1))))):
+        writer.add_message(channels[rng.randrange(2)], i, data, i, sequence=i)
+    writer.finish()
+    return file.getvalue()
+
+
+@contextlib.contextmanager
+def little_memory() -> Iterator[None]:
+    """Check that this process takes no more than 300 MB more for a while."""
+    before = _memory_mb("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the largest so far is the present one
+    yield
+    assert _memory_mb("VmHWM") - before < 300.0
+
+
+def _memory_mb(name: str) -> float:
+    (line,) = (one for one in Path("/proc/self/status").read_text(encoding="ascii").splitlines() if name in one)
+    return int(line.split()[1]) / 1024.0
+
+
+def receiver_settings(rng: random.Random, folder: Path) -> None:
+    """Settings of a receiver are refused, or it runs with them, whatever its files are."""
+    names = ('"s.json"', '"/"', '"\\u0000"', f'"{"x" * 300}"', '"none/s.json"', '"receiver.toml"', '""')
+    text = RECEIVER + f"state_file = {rng.choice(names)}\napplied_file = {rng.choice(names)}\n".encode()
+    way = rng.randrange(3)
+    (folder / "receiver.toml").write_bytes(text if way == 0 else changed(rng, RECEIVER if way == 1 else text))
+    try:
+        settings, _ = load_settings(folder / "receiver.toml")
+        receiver: Any = Receiver(settings)
+    except ReceiverError as error:
+        assert "\n" not in str(error) and len(str(error)) < 2000, str(error)[:3000]
+        return
+    if way == 0:
+        receiver._accepted = True
+        receiver._save()
+        if settings.applied_file:
+            receiver.record(1.0)
+
+
 def payloads(rng: random.Random, folder: Path) -> None:
     """A receiver survives what is published, and follows the service again."""
     Attack(rng, folder, check_clock=rng.random() < 0.5).run(20)
@@ -186,6 +270,8 @@ KINDS: dict[str, Callable[[random.Random, Path], None]] = {
     "models": model,
     "tables": table,
     "files that are none": no_file,
+    "recordings": recording,
+    "settings of a receiver": receiver_settings,
 }
 
 

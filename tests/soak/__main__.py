@@ -45,10 +45,14 @@ def report_month(days: float, seed: int) -> bool:
     return found.clean and not result.minutes["not accounted for"]
 
 
-def report_kills(count: int, machines: int, seed: int) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        results = kills.side_by_side(Path(folder), count, machines, seed)
+def report_kills(count: int, machines: int, seed: int) -> bool:
     print(f"\nkill −9, {machines} machines side by side, seed {seed}")
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            results = kills.side_by_side(Path(folder), count, machines, seed)
+        except AssertionError as error:
+            row("FAILED", error)
+            return False
     for moment in dict.fromkeys(kills.MOMENTS):
         row(f"kills: {moment}", sum(result.kills[moment] for result in results))
     row("offsets received, all on disk to the bit", sum(result.offsets - result.early for result in results))
@@ -62,6 +66,7 @@ def report_kills(count: int, machines: int, seed: int) -> None:
         f"{max(r.largest_share_of_rate for r in results):.2f}",
     )
     row("seconds", f"{max(result.seconds for result in results):.0f}")
+    return True
 
 
 def report_hostile(count: int, seed: int) -> bool:
@@ -102,7 +107,7 @@ def main() -> int:
     good = report_month(given.days, given.seed) if given.days else True
     good = report_faults(given.faults, given.seed) and good if given.faults else good
     if given.kills:
-        report_kills(given.kills, given.machines, given.seed)
+        good = report_kills(given.kills, given.machines, given.seed) and good
     if given.hostile:
         good &= report_hostile(given.hostile, given.seed)
     if given.forgeries:

@@ -28,8 +28,8 @@ def report(count: int, seed: int) -> bool:
             one.mkdir()
             tried = forgery.attacked(originals, one, number)
             shutil.rmtree(one)
-            kinds[tried.kind] += 1
-            found[tried.kind] += tried.found
+            kinds.update(tried.kind.split(" + "))
+            found.update(tried.kind.split(" + ") if tried.found else ())
             if tried.deceived:
                 wrong.append(f"seed {number}: {tried.kind}: {tried.deceived}")
     print(f"\nforged recordings, seeds {seed} to {seed + count - 1} (tests/fuzz/forgery.py); three audits of each:")

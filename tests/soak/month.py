@@ -25,6 +25,7 @@ from compensator.model.model_file import parse_model
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import decode, first_sequence, read_messages, recordings
 from compensator.recording.recorder import McapRecorder
+from compensator.recording.signature import Signer
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.transfer.restart import resume
@@ -32,6 +33,7 @@ from drivers.errors import DeviceDisconnected, DeviceTimeout
 from drivers.reading import Quality, Reading
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.audit.made import CONFIG, MACHINE, QUILL
+from tests.audit.test_signatures import write_key
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice
 
 DAY = 1440
@@ -105,6 +107,8 @@ class _Machine:
         self.world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), seed)
         self.device = FakeDevice([self.world.source(name) for name in CHANNELS])
         self.disk = _Disk(patch)
+        self.private, self.public = write_key(folder, "machine", 7)
+        self.head = folder / "machine.head.json"
         self.result = Month(days=days)
         self.config = parse_config(CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0"), source="test")
         self.config_bytes = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
@@ -132,7 +136,13 @@ class _Machine:
         self._ending, self.away_min = "", 0
         loaded = LoadedConfig(config=self.config, path=self.folder / "m.toml", data=self.config_bytes)
         resumed = resume(loaded, parse_model(QUILL, source="test"))
-        recorder = McapRecorder(self.folder / "rec", MACHINE, {"config.toml": self.config_bytes, "model.toml": QUILL})
+        recorder = McapRecorder(
+            self.folder / "rec",
+            MACHINE,
+            {"config.toml": self.config_bytes, "model.toml": QUILL},
+            signer=Signer(self.private),
+            head=self.head,
+        )
         daemon = self.daemon = Daemon(
             config=self.config,
             compensation=resumed.compensation,
@@ -277,7 +287,7 @@ def run(folder: Path, days: float, *, seed: int = 1) -> tuple[Month, Audit]:
     result.seconds = time.monotonic() - began
     count_minutes(folder / "rec", result)
     began = time.monotonic()
-    found = audit(recordings(folder / "rec", MACHINE))
+    found = audit(recordings(folder / "rec", MACHINE), public_key=machine.public, head=machine.head)
     result.audit_seconds = time.monotonic() - began
     result.files, result.early = len(found.files), sum(file.early for file in found.files)
     return result, found
