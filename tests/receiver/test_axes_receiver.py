@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from compensator.receiver import (
     AppliedAxes,
@@ -134,6 +136,32 @@ def test_through_a_router_together_or_not_at_all(tmp_path: Path) -> None:
                 assert any("following" in line for line in process.stdout)
             finally:
                 process.terminate()
+
+
+def test_a_stranger_that_answers_with_thousands_of_keys_holds_up_no_offset(tmp_path: Path) -> None:
+    """Zenoh's thread waits for the buffer of an answer: whoever asks by a pattern lets a stranger fill it."""
+    port = free_port()
+
+    def flood(query: Any) -> None:
+        with query:
+            for i in range(3000):
+                asked_for = str(query.key_expr)
+                with suppress(zenoh.ZError):  # not what was asked for
+                    query.reply(asked_for.replace("*", f"k{i}"), b"x" * 1000)
+
+    with router(port):
+        service, stranger = ScriptedService(port), ScriptedService(port, "shop/stranger")
+        flooding = stranger.session.declare_queryable("shop/vmc-07/thermal/*/offset", flood)
+        try:
+            with AxesReceiver(loaded(written(tmp_path, port))) as receiver:
+                until(lambda: receiver.poll() and receiver.connected, "a connection")
+                for seq in (1, 2):
+                    service.put_axes(seq, y=10.0 * seq, z=5.0, a=1.0)
+                    until(lambda seq=seq: receiver.poll().seq == seq, f"sample {seq}")
+        finally:
+            flooding.undeclare()
+            stranger.close()
+            service.close()
 
 
 @pytest.mark.parametrize(
