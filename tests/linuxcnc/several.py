@@ -228,7 +228,7 @@ def service_axes(folder: Path) -> None:
 
         process = site.start()
         try:
-            until(lambda: abs(heard.whole.get(heard.newest(), {}).get("z_offset_um", 0.0)) > 1.0, "an offset")
+            until(lambda: abs(heard.whole.get(heard.newest(), {}).get("z_offset_um") or 0.0) > 1.0, "an offset")
             control.do("states", "ESTOP_RESET")
             control.do("states", "ON")
             control.do("home")
