@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from compensator.clock import NS
 
 _STAMP = "%Y%m%dT%H%M%SZ"
+_REST = re.compile(r"_[0-9]{8}T[0-9]{6}Z(-[0-9]{3,4})?\.mcap")
 
 
 def day_of(time_utc_ns: int) -> str:
@@ -44,6 +46,25 @@ def names(folder: Path, of: str, time_utc_ns: int, newest: Path | None = None) -
     for count in range(number, number + 1000):
         ending = f"-{count:03d}" if count else ""
         yield folder / f"{of}_{stamp}{ending}.mcap"
+
+
+def is_name(path: Path, of: str) -> bool:
+    """Return whether a file has a name that this module gives.
+
+    Examples
+    --------
+    >>> [is_name(Path(f"m_{rest}.mcap"), "m") for rest in ("20260105T060000Z", "20260105T060000Z-002")]
+    [True, True]
+    >>> [is_name(Path(f"m_{rest}.mcap"), "m") for rest in ("20260105T060000Z-copy", "00000000T000000Z")]
+    [False, False]
+    """
+    if _REST.fullmatch(path.name[len(of) :]) is None:
+        return False
+    try:
+        began_ns(path, of)
+    except ValueError:
+        return False
+    return True
 
 
 def began_ns(path: Path, of: str) -> int:

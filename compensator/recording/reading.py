@@ -14,6 +14,7 @@ from compensator.messages import MESSAGES, UNREADABLE, Chain
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names_axes, topic_of
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
+from compensator.recording.naming import is_name
 
 #: Most bytes and records of a group: what one sample writes is a thousandth of that, a model that is adopted a tenth.
 GROUP_BYTES, GROUP_RECORDS = 16_000_000, 10_000
@@ -239,8 +240,9 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: RawRecord, file: str)
 
 
 def recordings(folder: Path, machine: str) -> list[Path]:
-    """Return a machine's recordings in the order in which they were started."""
-    return _found(folder, f"{machine}_????????T??????Z*.mcap")
+    """Return a machine's recordings in the order in which they were started, by the names that a recorder gives."""
+    found = _found(folder, f"{machine}_????????T??????Z*.mcap")
+    return [path for path in found if is_name(path, machine)]
 
 
 def recordings_in(given: Iterable[Path]) -> list[Path]:

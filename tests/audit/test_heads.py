@@ -412,3 +412,13 @@ def _up_to_last_seal(path: Path) -> bytes:
             if record.topic == "seal":
                 end = container.position
     return path.read_bytes()[:end]
+
+
+@pytest.mark.parametrize("name", ["20990101T000000Z-copy", "00000000T000000Z", "20260105T060000Z-"])
+def test_a_strangers_file_stops_no_recording_and_no_finishing(shop: Shop, name: str) -> None:
+    shop.rec.mkdir()
+    (shop.rec / f"{MACHINE}_{name}.mcap").touch()
+    shop.start().run(10).kill()
+    shop.start(10).run(10).stop()
+    assert [file.end for file in shop.audit(head=True).files] == [RecordingEnd.RECOVERED, RecordingEnd.FINISHED]
+    assert shop.audit(head=True).clean

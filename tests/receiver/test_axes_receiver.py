@@ -98,7 +98,7 @@ def test_through_a_router_together_or_not_at_all(tmp_path: Path) -> None:
         sends(1, heard=False)
         with AxesReceiver(loaded(path)) as receiver:
             at(receiver, 2.0, -2.0)  # by the query: 1 µm and a tenth of a metre of slope
-            assert codes(receiver.poll(read)) == {"no_tool_length", "further_axes"}
+            until(lambda: codes(receiver.poll(read)) == {"no_tool_length", "further_axes"}, "what is said")
             service.put_length(250.0)
             at(receiver, 5.0, -2.0)  # and 20 µrad on 150 mm
             sends(2, without="z", y=30.0)
@@ -107,7 +107,7 @@ def test_through_a_router_together_or_not_at_all(tmp_path: Path) -> None:
             at(receiver, 5.0, -2.0)
             sends(3, y=3.0)
             at(receiver, 7.0, -2.0)
-            assert codes(receiver.poll(read)) == {"further_axes"}
+            until(lambda: codes(receiver.poll(read)) == {"further_axes"}, "what is said")
             service.put_length(None)
             at(receiver, 4.0, -2.0)
             service.put_length("250")  # type: ignore[arg-type]
