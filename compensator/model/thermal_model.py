@@ -41,6 +41,8 @@ PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
 _ROUNDING = 100.0
 #: An inverse pole closer to −1 than this rings for more than about a dozen samples.
 RINGING_LIMIT = -0.8
+#: Smallest standard deviation of noise, in its unit.
+LEAST_NOISE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,8 +123,9 @@ class Estimator:
     def __post_init__(self) -> None:
         for name in ("t_q_noise_std_k", "at_noise_std_k", "drive_walk_std", "at_walk_std_k"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ModelError(f"estimator: {name} = {value!r}, expected a finite number above 0")
+            # Their squares enter a division: beyond these bounds the estimate would be no number.
+            if not LEAST_NOISE <= value <= 1.0 / LEAST_NOISE:
+                raise ModelError(f"estimator: {name} = {value!r}, expected from {LEAST_NOISE:g} to {1 / LEAST_NOISE:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

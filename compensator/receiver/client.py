@@ -7,6 +7,7 @@ not answer would block the caller's loop.
 
 from __future__ import annotations
 
+import errno
 import json
 import threading
 import time
@@ -312,6 +313,8 @@ class Client(ABC):
         if self._state_file is None or not accepted:
             return
         try:
+            if self._state_file.exists() and not self._state_file.is_file():
+                raise OSError(errno.EINVAL, "not a regular file")  # a device would be gone
             part = self._state_file.with_name(self._state_file.name + ".part")
             write_file(part, json.dumps(self._modes.snapshot()))
             part.replace(self._state_file)
