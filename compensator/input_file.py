@@ -18,7 +18,7 @@ from compensator.errors import UsageError
 SETTINGS_BYTES, MODEL_BYTES, KEY_BYTES, RESULT_BYTES = 1_000_000, 1_000_000, 100_000, 10_000_000
 #: Deepest key of a TOML file; the time to read one grows with the square of it.
 KEY_PARTS = 32
-_PART = rb"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d}" % KEY_PARTS)
 
 

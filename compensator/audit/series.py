@@ -19,9 +19,10 @@ from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.errors import DataError, UsageError
 from compensator.recording.chain import NOTHING
 from compensator.recording.head import read_head
+from compensator.recording.naming import order_of
 from compensator.recording.signature import Verifier
 
-_NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
+_NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3,4})?\.mcap$")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,7 +241,7 @@ def combine(
         Names of the recordings whose ends the head states.
     """
     # By the names at their creation, which show the order even if the clock was set back.
-    files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
+    files = sorted(map(_named, audits), key=lambda f: (f.machine, order_of(f.original.removesuffix(".mcap"))))
     series = _Series(files, signed, newest)
     read = [file for file in files if file.is_recording]
     for _, of_machine in groupby(read, key=lambda file: file.machine):
@@ -274,9 +275,9 @@ def _named(file: RecordingAudit) -> RecordingAudit:
     return file if name is None or file.machine else replace(file, machine=name["machine"])
 
 
-def _started(original: str) -> str:
+def _started(original: str) -> tuple[str, int]:
     """Return the part of a file's name that shows when it was started."""
-    return original.removesuffix(".mcap").rpartition("_")[2]
+    return order_of(original.removesuffix(".mcap").rpartition("_")[2])
 
 
 class _Series:
@@ -289,9 +290,10 @@ class _Series:
         self._names = {file.original: file for file in files}
         self._first_of: dict[tuple[str, str], str] = {}
         self._removed = {name for file in files for name in file.removed}
-        self._newest = {file.machine: file.file for file in files}
+        begun = [file for file in files if file.last] or files
+        self._newest = {file.machine: file.file for file in begun}
         #: Only the file that was started last may still be without its next seal; a head states which one that is.
-        self._live = newest or (max(files, key=lambda file: _started(file.original)).file if files else "")
+        self._live = newest or (max(begun, key=lambda file: _started(file.original)).file if begun else "")
         self._signed = signed
         self.remarks: list[Remark] = []
 
@@ -379,7 +381,7 @@ class _Series:
         """Check the link of a file with a chain to the previous one that has one, over files without between them."""
         named = next((file for file in between if file.original == after.previous_file), None)
         if named is not None:
-            began = named.end in (RecordingEnd.OPEN, RecordingEnd.TORN)
+            began = named.end not in (AuditFinding.DAMAGED, AuditFinding.TRUNCATED)  # these are findings of their own
             if began and after.previous != NOTHING.hex():
                 self._find(Fault.MORE_WAS_THERE, named, next=after.file)
             elif began and before is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any
 
@@ -64,13 +64,19 @@ def in_parallel(jobs: Sequence[Callable[[], Any]], progress: Progress) -> list[A
     progress : callable
         Called with how many jobs of how many are done.
     """
-    results: list[Any] = []
+    progress(0, len(jobs))
     with workers(len(jobs), None) as executor:
-        pending = [executor.submit(in_one_thread, job) for job in jobs] if executor else jobs
-        for one in pending:
-            progress(len(results), len(jobs))
-            results.append(one.result() if isinstance(one, Future) else in_one_thread(one))
-    return results
+        if executor is None:
+            results = []
+            for job in jobs:
+                results.append(in_one_thread(job))
+                progress(len(results), len(jobs))
+            return results
+        pending = [executor.submit(in_one_thread, job) for job in jobs]
+        for done, one in enumerate(as_completed(pending), start=1):
+            one.result()
+            progress(done, len(jobs))
+        return [one.result() for one in pending]
 
 
 @contextmanager

@@ -205,8 +205,9 @@ def no_further_than_seen(remainder: Regression, evidence: Evidence) -> Regressio
     It explains nothing, so nothing says that it holds where the machine does what the data did not show.
     """
     blocks = remainder.blocks(evidence.context.period_min)
-    added = np.concatenate([remainder.law(record, filters(blocks)) for record in evidence.signals])[evidence.used]
-    most_um = float(max(np.max(added), 0.0) - min(np.min(added), 0.0))
+    # Also where Y was not measured: with probes that is most of the record.
+    added = np.concatenate([remainder.law(record, filters(blocks)) for record in evidence.signals])
+    most_um = float(max(np.nanmax(added), 0.0) - min(np.nanmin(added), 0.0))
     return dataclasses.replace(remainder, most_um=most_um)
 
 

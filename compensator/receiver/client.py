@@ -278,9 +278,10 @@ class Client(ABC):
         self._query_latest()
 
     def _query_latest(self) -> None:
-        keys = [*((key, self._answers) for key in self._latest_keys), ("status", self._status_answers)]
-        for key, answers in keys:
-            if len(answers) < _BUFFER:
+        keys = [(self._latest_keys, self._answers), (("status",), self._status_answers)]
+        for names, answers in keys:
+            # All axes are asked for, or none.
+            for key in names if len(answers) < _BUFFER * len(names) else ():
                 # A ring channel would lose the answers when the query ends.
                 handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
                 answers.append(self._session.get(self._key(key), handler, timeout=ANSWER_TIMEOUT_S))

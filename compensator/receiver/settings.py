@@ -25,7 +25,7 @@ SETTINGS_MAX_BYTES, ZENOH_MAX_BYTES, STATE_MAX_BYTES = 1_000_000, 1_000_000, 10_
 ZENOH_BRACKETS = 15_000
 #: Deepest key of a settings file; the time to read one grows with the square of it.
 KEY_PARTS = 32
-_PART = rb"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d}" % KEY_PARTS)
 _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
@@ -323,14 +323,18 @@ _EXPECTED = {
 }
 
 
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and "\0" not in value
+
+
 def _value(value: Any, kind: str, where: str) -> Any:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if kind == "tuple[str, ...]" and isinstance(value, list) and all(isinstance(item, str) for item in value):
+    if kind == "tuple[str, ...]" and isinstance(value, list) and all(map(_is_text, value)):
         return tuple(value)
     if kind == "float" and number and -_LARGEST < value < _LARGEST:
         return float(value)
     if (kind == "int" and number and isinstance(value, int)) or (kind == "bool" and isinstance(value, bool)):
         return value
-    if kind == "str" and isinstance(value, str) and "\0" not in value:
+    if kind == "str" and _is_text(value):
         return value
     raise ReceiverError(f"{where} = {repr(value)[:60]}: expected {_EXPECTED[kind]}")

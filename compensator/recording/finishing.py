@@ -9,6 +9,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from compensator.recording import chain
 from compensator.recording.compaction import Copy, rewrite
 from compensator.recording.container import PAYLOAD, Contents, Message
 from compensator.recording.naming import began_ns
-from compensator.recording.reading import recordings
+from compensator.recording.reading import has_begun, recordings
 from compensator.recording.signature import Signer
 
 log = logging.getLogger("compensator")
@@ -170,10 +171,21 @@ class Finisher:
         with self._lock:
             self._remarks = [*self._remarks[-99:], (text, data.table())]
 
+    def _first_needed(self, paths: Sequence[Path]) -> int:
+        """Return the place of the second newest file that holds a chain; others are no end from which one continues."""
+        needed = 2
+        for place in range(len(paths) - 1, -1, -1):
+            with suppress(DataError):
+                needed -= has_begun(paths[place])
+            if not needed:
+                return place
+        return 0
+
     def _remove_oldest(self, now_ns: int) -> bool:
         """Remove files beyond the retention limit; return whether a file was removed.
 
-        The newest two are kept: the one that is being written, and the finished one that the next start needs.
+        The newest two with a chain are kept: the one that is being written, and the finished one that the next start
+        needs.
         """
         limits = self._retention
         if limits.keep_days is None and limits.keep_mb is None:
@@ -183,7 +195,7 @@ class Finisher:
         removed = []
         try:
             sizes = {path: path.stat().st_size for path in paths}
-            for path in paths[:-2]:
+            for path in paths[: self._first_needed(paths)]:
                 too_much = limits.keep_mb is not None and sum(sizes.values()) > limits.keep_mb * 1e6
                 if not too_much and began_ns(path, self._machine) >= oldest_ns:
                     break

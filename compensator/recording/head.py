@@ -18,7 +18,8 @@ from compensator.atomic_write import replace_file
 from compensator.errors import DataError, UsageError
 from compensator.input_file import read_file
 from compensator.messages import UNREADABLE
-from compensator.recording.reading import last_value, recordings, values_of
+from compensator.recording.naming import order_of
+from compensator.recording.reading import has_begun, last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
 
 #: Number of files whose ends are kept: the live one, and earlier ones whose recovery a kill has interrupted.
@@ -119,10 +120,10 @@ class HeadKeeper:
         Raises
         ------
         OSError
-            If it cannot be written; the old head is kept.
+            If it cannot be written; the old file is kept.
         """
         end = End(file=file, synced=synced.hex(), pending=[value.hex() for value in pending])
-        ends = (*(one for one in self.ends if one.file != file), end)[-KEPT:]
+        ends = _kept([one for one in self.ends if one.file != file], end)
         head = Head(
             chain_head=1,
             machine=self._machine,
@@ -134,6 +135,16 @@ class HeadKeeper:
         head = msgspec.structs.replace(head, signature=self._signer.sign_bytes(head.signed_bytes()))
         self.ends = ends
         replace_file(self.path, msgspec.json.encode(head), mode=0o640)
+
+
+def _kept(before: list[End], end: End) -> tuple[End, ...]:
+    """Return the ends that are kept: files that never came to disk, as on a full one, go first."""
+    for one in [*(one for one in before if not one.synced), *before]:
+        if len(before) < KEPT:
+            break
+        if one in before:
+            before.remove(one)
+    return (*before, end)
 
 
 def read_head(path: Path, verifier: Verifier | None = None) -> Head:
@@ -202,7 +213,7 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
         The head.
     """
     there = recordings(folder, machine)
-    # A kill before the first sync leaves a file without a record, which nothing continues.
+    # A kill before the first sync leaves a file without a record, which nothing continues; damage is another matter.
     newest = next((path for path in reversed(there) if not _is_empty(path)), there[-1] if there else None)
     for end in reversed(keeper.ends if keeper is not None else ()):
         path = folder / end.file
@@ -210,7 +221,7 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
             if not end.synced:  # a kill before its first sync
                 continue
             return Previous(end.file, bytes.fromhex(end.synced), "is missing")
-        if newest is not None and newest.stem > path.stem:
+        if newest is not None and order_of(newest.stem) > order_of(path.stem):
             return Previous(newest.name, _value(newest), f"is newer than {end.file}, the last recording of the head")
         values = values_of(path)
         if not values:
@@ -227,9 +238,9 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
 
 
 def _is_empty(path: Path) -> bool:
-    """Return whether a recording ends before its first record; one that cannot be read is not empty."""
+    """Return whether a recording has no chain yet; one that is no MCAP file is not empty."""
     try:
-        return path.stat().st_size == 0 or not last_value(path)
+        return path.stat().st_size == 0 or not has_begun(path)
     except (DataError, OSError):
         return False
 

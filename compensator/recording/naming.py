@@ -48,6 +48,18 @@ def names(folder: Path, of: str, time_utc_ns: int, newest: Path | None = None) -
         yield folder / f"{of}_{stamp}{ending}.mcap"
 
 
+def order_of(stem: str) -> tuple[str, int]:
+    """Return what names are sorted by: the time, and then the number of files of one second.
+
+    Examples
+    --------
+    >>> sorted(("m-7_20260105T060000Z-1000", "m-7_20260105T060000Z-999", "m-7_20260105T060000Z"), key=order_of)
+    ['m-7_20260105T060000Z', 'm-7_20260105T060000Z-999', 'm-7_20260105T060000Z-1000']
+    """
+    stamp, dash, number = stem.rpartition("-")
+    return (stamp, int(number)) if dash and number.isdecimal() and number.isascii() else (stem, 0)
+
+
 def is_name(path: Path, of: str) -> bool:
     """Return whether a file has a name that this module gives.
 

@@ -14,7 +14,7 @@ from compensator.messages import MESSAGES, UNREADABLE, Chain
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names_axes, topic_of
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
-from compensator.recording.naming import is_name
+from compensator.recording.naming import is_name, order_of
 
 #: Most bytes and records of a group: what one sample writes is a thousandth of that, a model that is adopted a tenth.
 GROUP_BYTES, GROUP_RECORDS = 16_000_000, 10_000
@@ -111,7 +111,7 @@ def groups_of(container: Container) -> Iterator[Group]:
         for record in records_of(container):
             topic = record.topic
             size = size + len(record.body) if records else len(record.body)
-            if size > GROUP_BYTES or len(records) > GROUP_RECORDS:
+            if size > GROUP_BYTES or len(records) >= GROUP_RECORDS:
                 raise Damaged(container.path, container.position, "a group of records that is too long")
             if not end:
                 topics = {channel.topic for channel in container.contents.channels.values()}
@@ -268,8 +268,7 @@ def recordings_in(given: Iterable[Path]) -> list[Path]:
 
 
 def _found(folder: Path, pattern: str) -> list[Path]:
-    # Sorted by stem: a second file of the same second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
-    return sorted(folder.glob(pattern), key=lambda path: path.stem)
+    return sorted(folder.glob(pattern), key=lambda path: order_of(path.stem))
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
@@ -289,7 +288,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
         began[path] = run.get("file", path.name).removesuffix(".mcap")
     if len(machines) > 1:
         raise DataError(f"recordings of {', '.join(sorted(machines))}; expected those of one machine")
-    return sorted(began, key=began.__getitem__)
+    return sorted(began, key=lambda path: order_of(began[path]))
 
 
 def last_value(path: Path) -> bytes:
@@ -309,6 +308,17 @@ def last_value(path: Path) -> bytes:
         before_seal, value = value, following
         recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
     return before_seal if recovered else value
+
+
+def has_begun(path: Path) -> bool:
+    """Return whether a file holds the beginning of a chain.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
+    return next(_linked(path), None) is not None
 
 
 def values_of(path: Path) -> set[bytes]:

@@ -24,7 +24,7 @@ from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.head import HeadKeeper, previous_end
 from compensator.recording.live_file import TOPICS, RecordingFile
-from compensator.recording.naming import day_of, names
+from compensator.recording.naming import day_of, names, order_of
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
 
@@ -79,8 +79,8 @@ class McapRecorder:
         self._day = ""
         #: A file that was given up and could not be cut, and the size that was synced.
         self._uncut: tuple[Path, int] | None = None
-        #: Why the next file is opened, and the last chain value of the previous file if known.
-        self._reason, self._last = "start", b""
+        #: Why the next file is opened, and name and last chain value of the previous file if known.
+        self._reason, self._last_name, self._last = "start", "", b""
         self.path: Path | None = None
 
     def write(
@@ -173,7 +173,7 @@ class McapRecorder:
         except OSError:
             self._give_up()
             raise
-        self._live, self._reason, self._last = None, reason, live.head
+        self._live, self._reason, self._last, self._last_name = None, reason, live.head, live.path.name
         self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
@@ -196,11 +196,11 @@ class McapRecorder:
                 path.unlink(missing_ok=True)
             self._uncut = None
         previous = recordings(self._folder, self._machine)
-        before, name = self._last, previous[-1].name if previous else ""
-        if not before:
-            name, before = self._read_end()
-        newest = max(filter(None, (previous[-1].stem if previous else "", name.removesuffix(".mcap"))), default="")
-        paths = names(self._folder, self._machine, time_utc_ns, self._folder / f"{newest}.mcap" if newest else None)
+        # What is newest in the folder need not be what this recorder has written.
+        name, before = (self._last_name, self._last) if self._last else self._read_end()
+        known = [*previous[-1:], *([self._folder / name] if name else [])]
+        newest = max(known, key=lambda path: order_of(path.stem), default=None)
+        paths = names(self._folder, self._machine, time_utc_ns, newest)
         live = self._live = RecordingFile(
             paths, self._machine, before or chain.NOTHING, time_utc_ns, self._topics, self._axes
         )

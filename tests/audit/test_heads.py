@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from mcap.writer import Writer
 
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit, audit, combine, summary
@@ -18,9 +19,17 @@ from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
 from compensator.recording.chain import NOTHING
 from compensator.recording.container import Container, Damaged
-from compensator.recording.finishing import compact
-from compensator.recording.head import LONGEST, read_head
-from compensator.recording.reading import first_sequence, recordings, records_of, values_of
+from compensator.recording.finishing import Finisher, Retention, compact
+from compensator.recording.head import KEPT, LONGEST, HeadKeeper, read_head
+from compensator.recording.reading import (
+    GROUP_BYTES,
+    GROUP_RECORDS,
+    first_sequence,
+    groups_of,
+    recordings,
+    records_of,
+    values_of,
+)
 from compensator.recording.signature import Signer, Verifier
 from compensator.service.loading import head_file
 from tests.audit.attacks import edited_offset, rechained, rechained_all, unsigned_seals, without_seals
@@ -422,3 +431,63 @@ def test_a_strangers_file_stops_no_recording_and_no_finishing(shop: Shop, name: 
     shop.start(10).run(10).stop()
     assert [file.end for file in shop.audit(head=True).files] == [RecordingEnd.RECOVERED, RecordingEnd.FINISHED]
     assert shop.audit(head=True).clean
+
+
+def test_the_file_before_an_empty_one_may_still_be_without_its_next_seal(shop: Shop) -> None:
+    shop.start().run(20).kill()
+    (shop.rec / f"{MACHINE}_20260105T230000Z.mcap").touch()
+    assert shop.audit().clean and shop.audit(head=True).clean, summary(shop.audit())
+
+
+def test_an_empty_file_beside_a_running_service_is_not_the_one_before_its_next(shop: Shop) -> None:
+    service = shop.start().run(20)
+    (shop.rec / f"{MACHINE}_20260105T230000Z.mcap").touch()
+    service.recorder.start_new()
+    service.run(5).stop()
+    assert shop.audit(head=True).clean, summary(shop.audit(head=True))
+
+
+def test_a_full_disk_that_opens_no_file_forgets_no_end(shop: Shop) -> None:
+    """The head keeps the end of the file that was broken off, however often a new one cannot be begun."""
+    shop.start().run(20).kill()
+    keeper = HeadKeeper(shop.head, MACHINE, shop.signer)
+    known = keeper.ends
+    for i in range(9):
+        keeper.expect(f"{MACHINE}_20260106T0{i}0000Z.mcap", b"", [b"x"], 0)
+    assert all(end in keeper.ends for end in known) and len(keeper.ends) <= KEPT
+    assert keeper.ends[-1].file.endswith("T080000Z.mcap")
+
+
+def test_a_file_without_a_record_is_none_of_those_that_retention_keeps(shop: Shop) -> None:
+    for i in range(3):
+        shop.start(10 * i).run(10).stop()
+    for hour in (22, 23):
+        (shop.rec / f"{MACHINE}_20260105T{hour}0000Z.mcap").touch()
+    finisher = Finisher(shop.rec, MACHINE, Retention(keep_days=1), shop.signer)
+    finisher.make_room(2**62)
+    finisher.wait()
+    assert [path.stat().st_size > 0 for path in shop.files] == [True, True, False, False]
+
+
+def test_a_finished_file_without_a_record_in_the_place_of_another_is_a_finding() -> None:
+    names = [f"{MACHINE}_20260105T0{hour}0000Z.mcap" for hour in (6, 7, 8)]
+    files = [RecordingAudit(file=name, original=name, machine=MACHINE, samples=1) for name in names]
+    for file, value, before in zip(files, ("11", "", "33"), ("", names[0], names[1]), strict=True):
+        file.last, file.previous_file = value * 32, before
+        file.previous = "22" * 32 if before == names[1] else NOTHING.hex()
+    assert "truncated" in kinds(combine(files))
+
+
+@pytest.mark.parametrize(("count", "size"), [(GROUP_RECORDS + 1, 0), (20, GROUP_BYTES // 16)])
+def test_a_group_that_never_ends_is_damage(tmp_path: Path, count: int, size: int) -> None:
+    path = tmp_path / "long.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        sample, _ = (writer.register_channel(topic, "json", schema) for topic in ("/sample", "/chain"))
+        for i in range(count):
+            writer.add_message(sample, i, bytes(size), i, sequence=i)
+        writer.finish()
+    with Container(path) as container, pytest.raises(Damaged, match="too long"):
+        assert all(not group.whole for group in groups_of(container))

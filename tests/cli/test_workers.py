@@ -139,6 +139,6 @@ def test_independent_jobs_give_their_results_in_order_in_processes_of_their_own(
     results = in_parallel([partial(_job, i) for i in range(3)], lambda done, total: told.append((done, total)))
     assert [number for number, _ in results] == [0, 1, 2]
     assert {pid == os.getpid() for _, pid in results} == {cores == 1}
-    assert told == [(0, 3), (1, 3), (2, 3)]
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     with pytest.raises(ServiceError, match="job 1 cannot be done"):
         in_parallel([partial(_job, i, refused=i == 1) for i in range(3)], lambda done, total: None)

@@ -215,7 +215,9 @@ def _inserted(rng: random.Random, paths: list[Path]) -> None:
 def _emptied(rng: random.Random, paths: list[Path]) -> None:
     """Put a file without a record where one is or was, as a kill before its first sync leaves one."""
     path = rng.choice(paths)
-    path.with_name(path.name.replace("Z", f"Z-{rng.randrange(1, 9):03d}", 1)).touch()
+    if path.exists():
+        path = path.with_name(path.name.replace("Z", f"Z-{rng.randrange(1, 9):03d}", 1))
+    path.touch()
 
 
 ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
@@ -256,12 +258,14 @@ def attacked(originals: Originals, folder: Path, seed: int) -> Tried:
     kinds = rng.sample(list(ATTACKS), 2 if rng.random() < 0.5 else 1)
     # What is read by an attack must hold records.
     kinds.sort(key=lambda kind: kind == "emptied")
-    for i, one in enumerate(kinds):
-        paths = recordings(folder / "rec", MACHINE)
-        if i == 0 or len(paths) > 1:
-            with suppress(DataError) if i else nullcontext():
+    before, tried = recordings(folder / "rec", MACHINE), list[str]()
+    for one in kinds:
+        paths = before if one == "emptied" else recordings(folder / "rec", MACHINE)
+        if len(paths) > 1:
+            with suppress(DataError) if tried else nullcontext():
                 ATTACKS[one](rng, paths)
-    kind, found = " + ".join(kinds), list[bool]()
+                tried.append(one)
+    kind, found = " + ".join(tried), list[bool]()
     for head in (False, True):
         verdict = _verdict(originals, folder, head=head)
         found.append(verdict is None or not verdict.clean)

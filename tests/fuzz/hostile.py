@@ -7,12 +7,14 @@ survived is a result or a refusal of one line, in time, with an exit code that s
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import math
 import os
 import random
 import re
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -92,7 +94,8 @@ def changed(rng: random.Random, text: bytes) -> bytes:
         elif way == 6:
             new = rng.choice(("[", "{a = ")) * int(10 ** rng.uniform(0, 4.5))
         else:
-            new = "1\n" + ".".join(["k"] * int(10 ** rng.uniform(0, 4.7))) + " = 1"
+            part = rng.choice(("k", '"k"', "'k'", '"\\""'))
+            new = "1\n" + ".".join([part] * int(10 ** rng.uniform(0, 4.7))) + " = 1"
         text = text[: place.start(1)] + new.encode() + text[place.end(1) :]
     return mutated(rng.randrange(2**32), text) if rng.randrange(5) == 0 else text
 
@@ -190,25 +193,19 @@ def no_file(rng: random.Random, folder: Path) -> None:
 def recording(rng: random.Random, folder: Path) -> None:
     """A recording is audited or refused; whatever it says of itself, it costs no memory."""
     path = folder / f"vmc-07_20260105T060000Z{rng.choice(('', '-001'))}.mcap"
-    if rng.randrange(3) and len(_RECORDED) == 0:
-        _RECORDED.append(_recorded(folder))
-    if rng.randrange(3) and _RECORDED:
-        path.write_bytes(mutated(rng.randrange(2**32), _RECORDED[0]))
-    else:
-        path.write_bytes(_without_end(rng))
+    path.write_bytes(mutated(rng.randrange(2**32), _recorded()) if rng.randrange(3) else _without_end(rng))
     with little_memory():
         command(folder, "replay", path.name)
         command(folder, "export", path.name, "--out", "out.csv")
 
 
-_RECORDED: list[bytes] = []
-
-
-def _recorded(folder: Path) -> bytes:
+@functools.cache
+def _recorded() -> bytes:
     """The bytes of a recording of an hour."""
-    Service(folder / "made").run(60).stop()
-    (path,) = (folder / "made").glob("*.mcap")
-    return path.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        Service(Path(folder)).run(60).stop()
+        (path,) = Path(folder).glob("*.mcap")
+        return path.read_bytes()
 
 
 def _without_end(rng: random.Random) -> bytes:

@@ -332,6 +332,7 @@ def test_the_most_that_is_permitted_runs_and_one_channel_more_is_refused() -> No
         ({"std_factor": ((0.0, math.nan, 0.0, 0.0),)}, "std_factor = nan, expected finite"),
         ({"taus_min": (0.0, math.nan)}, "taus_min = nan, expected from 0 to"),
         ({"most_um": math.nan}, "most_um = nan, expected a number from 0 on"),
+        ({"most_um": 1e300}, "most_um = 1e\\+300, expected a number from 0 on"),
     ],
 )
 def test_the_constructor_refuses_what_the_file_would(changes: dict[str, Any], words: str) -> None:

@@ -3,8 +3,8 @@
 y += limited(Σ_c Σ_i gain_ci · L(τ_i) · [f_c(c) − f_c(c at the start)], most),   f_c(c) = c or c · |c|
 
 It corrects what the channels explain and no named effect does, and explains nothing itself: the search never proposes
-it, and it goes no further than the data showed it to go. With F the low-rank factor of the gains' covariance, φ the
-outputs of all lags and b what lies beyond the limit, its variance is Σ_r (F_r · φ)² + b².
+it, and where `most_um` is given it goes no further to either side. With F the low-rank factor of the gains' covariance,
+φ the outputs of all lags and b what lies beyond the limit, its variance is Σ_r (F_r · φ)² + b².
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ class Regression(BankEffect, Effect):
             _check_count("std_factor", row, gains, gains, "numbers in a row, one a gain")
         self._check_channels()
         _check_each("taus_min", self.taus_min, lambda tau: 0.0 <= tau <= 1e5, "from 0 to 100000")
-        _check_each("most_um", (self.most_um,), lambda most: most >= 0.0, "a number from 0 on")
+        is_limit = lambda most: 0.0 <= most <= LARGEST or most == math.inf  # noqa: E731
+        _check_each("most_um", (self.most_um,), is_limit, "a number from 0 on")
         for name, rows_of in (("gains", self.gains), ("std_factor", self.std_factor)):
             for row in rows_of:
                 _check_each(name, row, lambda value: -LARGEST < value < LARGEST, "finite")
