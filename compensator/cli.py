@@ -153,7 +153,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown:
         # argparse itself would name the help of the whole program.
         given.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
+    logging.basicConfig(stream=sys.stderr, format="%(message)s", force=True)
+    log.setLevel(logging.INFO)  # what libraries tell is of no use to an operator, what they warn of is
     try:
         answer = load(given.command)(given)
     except (CompensatorError, DriverError, OSError) as error:

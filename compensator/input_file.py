@@ -18,8 +18,11 @@ from compensator.errors import UsageError
 SETTINGS_BYTES, MODEL_BYTES, KEY_BYTES, RESULT_BYTES = 1_000_000, 1_000_000, 100_000, 10_000_000
 #: Deepest key of a TOML file; the time to read one grows with the square of it.
 KEY_PARTS = 32
-_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d}" % KEY_PARTS)
+# A part ends with its line at the latest, and what holds no keys is passed over whole: a scan never goes back.
+_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\[^\n])*+"?|'[^'\n]*+'?)"""
+_DEEP_KEY = rb"(?P<deep>" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d})" % KEY_PARTS
+_NO_KEY = rb"""\#[^\n]*+|\"{3}(?:[^"\\]|\\.|"(?!""))*+(?:\"{3,5})?|'{3}(?:[^']|'(?!''))*+(?:'{3,5})?"""
+_LEXEME = re.compile(_NO_KEY + rb"|" + _DEEP_KEY + rb"|" + _PART, re.DOTALL)
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -114,7 +117,7 @@ def parse_toml(data: bytes) -> dict[str, Any]:
     >>> parse_toml(b"a.b = 1")
     {'a': {'b': 1}}
     """
-    if _DEEP_KEY.search(data):
+    if any(lexeme["deep"] for lexeme in _LEXEME.finditer(data)):
         raise ValueError(f"a key of more than {KEY_PARTS} parts")
     try:
         return tomllib.loads(data.decode("utf-8"))

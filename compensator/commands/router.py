@@ -106,13 +106,23 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
         raise ServiceError(f"{path}: {error_text(error)}") from error
     with session:
         log.info("compensator: router listens on %s", ", ".join(endpoints))
-        session.info.declare_link_events_listener(_log_link, history=True)
+        session.info.declare_link_events_listener(_LinkLog(), history=True)
         await ended.wait()
 
 
-def _log_link(event: Any) -> None:
+class _LinkLog:
     """Log connections and disconnections."""
-    link = event.link
-    connected = event.kind == zenoh.SampleKind.PUT
-    who = link.auth_identifier or "a participant without a certificate"
-    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "connected" if connected else "disconnected")
+
+    def __init__(self) -> None:
+        self._open: set[tuple[str, str]] = set()
+
+    def __call__(self, event: Any) -> None:
+        """Log an event. Of a link that came while the listener was declared, Zenoh tells twice."""
+        link = event.link
+        connected = event.kind == zenoh.SampleKind.PUT
+        key = (str(link.zid), str(link.dst))
+        if connected == (key in self._open):
+            return
+        self._open ^= {key}
+        who = link.auth_identifier or "a participant without a certificate"
+        log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "connected" if connected else "disconnected")

@@ -129,7 +129,7 @@ def run(arguments: argparse.Namespace) -> None:
     # The watchdog ends the service by SIGABRT; the log then shows the current line of each thread.
     faulthandler.enable()
     if systemd.is_connected(os.environ, sys.stderr.fileno()):
-        logging.basicConfig(handlers=[systemd.JournalHandler()], level=logging.INFO, format="%(message)s", force=True)
+        logging.basicConfig(handlers=[systemd.JournalHandler()], format="%(message)s", force=True)
     with ServiceManager(os.environ) as manager:
         asyncio.run(_serve(arguments.config, manager))
     log.info("compensator: stopped, recording finished")

@@ -25,8 +25,11 @@ SETTINGS_MAX_BYTES, ZENOH_MAX_BYTES, STATE_MAX_BYTES = 1_000_000, 1_000_000, 10_
 ZENOH_BRACKETS = 15_000
 #: Deepest key of a settings file; the time to read one grows with the square of it.
 KEY_PARTS = 32
-_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d}" % KEY_PARTS)
+# A part ends with its line at the latest, and what holds no keys is passed over whole: a scan never goes back.
+_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\[^\n])*+"?|'[^'\n]*+'?)"""
+_DEEP_KEY = rb"(?P<deep>" + _PART + rb"(?:[ \t]*+\.[ \t]*+" + _PART + rb"){%d})" % KEY_PARTS
+_NO_KEY = rb"""\#[^\n]*+|\"{3}(?:[^"\\]|\\.|"(?!""))*+(?:\"{3,5})?|'{3}(?:[^']|'(?!''))*+(?:'{3,5})?"""
+_LEXEME = re.compile(_NO_KEY + rb"|" + _DEEP_KEY + rb"|" + _PART, re.DOTALL)
 _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
 
@@ -233,7 +236,7 @@ def load_tables(path: Path) -> dict[str, Any]:
     """
     try:
         data = read_file(path, SETTINGS_MAX_BYTES)
-        if _DEEP_KEY.search(data):
+        if any(lexeme["deep"] for lexeme in _LEXEME.finditer(data)):
             raise ReceiverError(f"{path}: a key of more than {KEY_PARTS} parts")
         return tomllib.loads(data.decode("utf-8"))
     except OSError as error:

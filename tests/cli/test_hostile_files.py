@@ -65,6 +65,10 @@ def test_a_path_of_many_coefficients(tmp_path: Path, capsys: pytest.CaptureFixtu
         (b"a = " + b"9" * 400_000, "digits"),
         (b"a" * 900_000, "Expected"),
         (b'"' * 900_000, "Expected"),
+        (b'"' + b'\\"' * 450_000, "Unterminated"),
+        (b'a = {b = """\' """"", ' + b"c." * 40 + b"c = 1}", "more than 32 parts"),
+        (b"a = {b = '''\" ''''', " + b"c." * 40 + b"c = 1}", "more than 32 parts"),
+        (b"a = 1 # ' \"\n" + b"c." * 40 + b"c = 1", "more than 32 parts"),
     ],
 )
 def test_toml_that_takes_long(text: bytes, words: str) -> None:
@@ -90,6 +94,14 @@ def test_a_configuration_of_zenoh_that_is_nested_deeply(
 
 
 def test_words_with_dots_are_no_deep_key() -> None:
+    dots = b"x." * 40 + b"x"
+    for quoted in (
+        b'a = """' + dots + b'"""',
+        b"a = '''\n" + dots + b"'''",
+        b"a = 1 # " + dots,
+        b'a = "' + dots + b'"',
+    ):
+        assert "a" in parse_toml(quoted)
     assert parse_toml(b'a = "1. 2. 3."\nb = "' + b"two words. " * 100 + b'"')["a"] == "1. 2. 3."
 
 

@@ -94,8 +94,8 @@ def changed(rng: random.Random, text: bytes) -> bytes:
         elif way == 6:
             new = rng.choice(("[", "{a = ")) * int(10 ** rng.uniform(0, 4.5))
         else:
-            part = rng.choice(("k", '"k"', "'k'", '"\\""'))
-            new = "1\n" + ".".join([part] * int(10 ** rng.uniform(0, 4.7))) + " = 1"
+            part, between = rng.choice((("k", "."), ('"k"', "."), ("'k'", "."), ('"\\""', "."), ('\\"', ""), ("'", "")))
+            new = "1\n" + rng.choice(("", '"', '"""')) + between.join([part] * int(10 ** rng.uniform(0, 5.3))) + " = 1"
         text = text[: place.start(1)] + new.encode() + text[place.end(1) :]
     return mutated(rng.randrange(2**32), text) if rng.randrange(5) == 0 else text
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -96,6 +97,16 @@ def test_bad_settings_get_one_line(tmp_path: Path, old: str, new: str, expected:
         load_settings(path)
     text = str(caught.value)
     assert expected in text and str(path) in text and "\n" not in text
+
+
+def test_keys_that_take_long_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "receiver.toml"
+    for text, expected in (("a" + ".a" * 100_000, "more than 32 parts"), ('"' + '\\"' * 400_000, "not a TOML file")):
+        path.write_text(f"{GOOD}{text} = 1\n")
+        began = time.monotonic()
+        with pytest.raises(ReceiverError, match=expected):
+            load_settings(path)
+        assert time.monotonic() - began < 60.0
 
 
 def test_a_code_has_one_meaning() -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +18,7 @@ import zenoh
 
 from compensator.certificates import check_files
 from compensator.cli import main
-from compensator.commands.router import checked
+from compensator.commands.router import _LinkLog, checked
 from compensator.config import Zenoh
 from compensator.service.command_client import operator_of_file
 from compensator.service.session import get, read_config_file, tls_files
@@ -52,6 +53,15 @@ def test_the_router_serves_says_who_comes_and_ends_on_sigterm(shop: Shop, tmp_pa
         for stream in (process.stdout, process.stderr):
             if stream is not None:
                 stream.close()
+
+
+def test_a_link_that_is_told_twice_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    """Zenoh tells of a link as an event and as history, if it comes while the router begins to listen to events."""
+    caplog.set_level("INFO", logger="compensator")
+    tell = _LinkLog()
+    for kind in (zenoh.SampleKind.PUT, zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE, zenoh.SampleKind.DELETE):
+        tell(SimpleNamespace(kind=kind, link=SimpleNamespace(auth_identifier="cnc-07", dst="tls/a:1", zid="ee")))
+    assert [message.split()[-1] for message in caplog.messages] == ["connected", "disconnected"]
 
 
 def changed(shop: Shop, tmp_path: Path, change: Any) -> Path:
