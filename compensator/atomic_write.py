@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -88,8 +89,10 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
     Raises
     ------
     OSError
-        If it cannot be written; the old file is kept.
+        If it cannot be written, or is a device, a pipe or a folder; what is there is kept.
     """
+    if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
         file.write(data)
         if sync:

@@ -75,7 +75,7 @@ def read_file(path: Path, most: int) -> bytes:
     """
     with open_file(path) as file:
         check_size(path, os.fstat(file.fileno()).st_size, most)
-        data = file.read(most + 1)
+        data = file.read(most + 1) or b""  # None: /proc/kmsg says it is a file, and would wait
     check_size(path, len(data), most)
     return data
 

@@ -36,6 +36,7 @@ from compensator.identify.settings import Method, Settings
 from compensator.identify.shared_poles import calibrated_together
 from compensator.identify.summary import MODEL, figures
 from compensator.model.free_run import FreeRunErrors
+from compensator.model.table import ONE_LINE, is_one_line, shown
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
 
@@ -129,6 +130,8 @@ def identify(
         etve_end_h=float(etve_end_h),
         folds=folds,
     )
+    if not is_one_line(name):
+        raise UsageError(f"name = {shown(name)}, expected {ONE_LINE}")
     # A wrong file is refused before the fit, which may take minutes.
     other = {} if reference is None else models_of(reference)
     sources = {

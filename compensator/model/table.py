@@ -11,6 +11,9 @@ from compensator.errors import ModelError
 
 #: Largest number of values in a list, and of lists in a list, unless a key has a limit of its own.
 LIST_LENGTH = 1000
+#: Longest text, and how a message says so.
+TEXT_LENGTH = 300
+ONE_LINE = f"at most {TEXT_LENGTH} printable characters"
 
 
 class TomlTable:
@@ -102,7 +105,14 @@ class TomlTable:
         if not isinstance(value, str) or (choices and value not in choices):
             expected = "one of: " + ", ".join(choices) if choices else "a string"
             raise ModelError(f"{self.where}: {key} = {shown(value)}, expected {expected}")
+        if not is_one_line(value):
+            raise ModelError(f"{self.where}: {key} = {shown(value)}, expected {ONE_LINE}")
         return value
+
+
+def is_one_line(value: str) -> bool:
+    """Return whether a text can stand in a message as it is: a name, a unit."""
+    return len(value) <= TEXT_LENGTH and value.isprintable()
 
 
 def shown(value: object) -> str:

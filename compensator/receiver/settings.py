@@ -181,7 +181,7 @@ def read_file(path: Path, most: int) -> bytes:
     with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(errno.EINVAL, "not a regular file")
-        data = file.read(most + 1)
+        data = file.read(most + 1) or b""  # None: /proc/kmsg says it is a file, and would wait
     if len(data) > most:
         raise OSError(errno.EFBIG, f"larger than {most} bytes")
     return data

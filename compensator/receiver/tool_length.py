@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from .limits import LONGEST_MM
@@ -32,12 +33,12 @@ class ToolLength:
         self.machine = machine
         self.reasons: tuple[Reason, ...] = ()
         self._length_mm: float | None = None
-        self._until_s = 0.0
-        self._heard = False
+        self._until_s = -math.inf
+        self._time_utc_ns: int | None = None
 
     def at(self, now_s: float) -> float | None:
         """Return the length at a time of the monotonic clock, mm; None if none is known or the last has expired."""
-        return self._length_mm if self._heard and now_s <= self._until_s else None
+        return self._length_mm if now_s <= self._until_s else None
 
     def receive(
         self, now_s: float, payload: bytes, *, utc_ns: Callable[[], int] | None = None, asked: bool = False
@@ -61,17 +62,21 @@ class ToolLength:
         bool
             Whether it is now the newest length.
         """
-        if asked and self._heard:
+        if asked and self._time_utc_ns is not None:
             return False
         try:
-            length_mm, until_s = self._parse(now_s, payload, utc_ns)
+            length_mm, until_s, time_utc_ns = self._parse(now_s, payload, utc_ns)
+            # Without a wall clock a time may be a forged one of next year, and nothing would replace it.
+            last_ns = self._time_utc_ns if utc_ns is not None and now_s <= self._until_s else None
+            if last_ns is not None and time_utc_ns < last_ns:
+                raise Rejected(Reason("replayed", f"{(last_ns - time_utc_ns) / 1e9:.1f} s older than the last"))
         except Rejected as rejected:
             self.reasons = (Reason(rejected.reason.code, f"tool_length: {rejected.reason.detail}"),)
             return False
-        self._length_mm, self._until_s, self._heard, self.reasons = length_mm, until_s, True, ()
+        self._length_mm, self._until_s, self._time_utc_ns, self.reasons = length_mm, until_s, time_utc_ns, ()
         return True
 
-    def _parse(self, now_s: float, payload: bytes, utc_ns: Callable[[], int] | None) -> tuple[float | None, float]:
+    def _parse(self, now_s: float, payload: bytes, utc_ns: Callable[[], int] | None) -> tuple[float | None, float, int]:
         table = decode(payload)
         check_schema(table)
         machine = table.get("machine")
@@ -87,4 +92,4 @@ class ToolLength:
             raise Rejected(Reason("clock_disagrees", f"{-age_s:.1f} s ahead of the wall clock here"))
         if age_s > valid_s:
             raise Rejected(Reason("late", f"{age_s:.1f} s old by the wall clock, valid for {valid_s:g} s"))
-        return length_mm, now_s + valid_s - max(age_s, 0.0)
+        return length_mm, now_s + valid_s - max(age_s, 0.0), time_utc_ns

@@ -34,6 +34,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
         ({"order": "222"}, "expected three integers"),
         ({"tdtf": 10.0, "method": "I"}, "expected two numbers"),
         ({"folds": 0}, "folds 0, expected at least 2"),
+        ({"name": "a\nb"}, "expected at most 300 printable"),
         ({"columns": ["t_q_degc"]}, "columns: list, expected names by role"),
     ],
 )

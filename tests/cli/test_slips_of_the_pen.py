@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensator.atomic_write import atomic_write
+from compensator.atomic_write import atomic_write, replace_file
 from compensator.cli import main
 
 HEADER = "t_s,t_q_degc,at_degc,y_um,heat_w\n"
@@ -198,6 +198,9 @@ def test_what_is_no_file_is_written_to_and_a_link_stays_one(tmp_path: Path) -> N
         file.write("t_s\n")
     reader.join()
     assert read == ["t_s\n"] and stat.S_ISFIFO(pipe.stat().st_mode)
+    with pytest.raises(OSError, match="not a regular file"):  # the head of a chain, for one
+        replace_file(pipe, b"")
+    assert stat.S_ISFIFO(pipe.stat().st_mode) and list(tmp_path.iterdir()) == [pipe]
     kept, link = tmp_path / "kept.csv", tmp_path / "link.csv"
     kept.write_text("before\n")
     link.symlink_to(kept)

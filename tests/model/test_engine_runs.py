@@ -299,6 +299,8 @@ TEXT = load_model.__globals__["read_model_bytes"]("quill").decode()
     ("old", "new", "expected"),
     [
         ("schema = 1", "schema = 2", "schema = 2, expected 1"),
+        ('name = "quill"', f'name = "{"q" * 301}"', "expected at most 300 printable characters"),
+        ('name = "quill"', 'name = "a\\u001b[2J"', "expected at most 300 printable characters"),
         ("sample_period_s = 60.0", "sample_period = 60.0", "unknown key 'sample_period'"),
         ('unit = "K/W"', 'unit = "m.W^-1"', "expected 'K/W'"),
         (

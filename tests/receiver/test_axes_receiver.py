@@ -252,6 +252,18 @@ def test_a_length_is_used_while_it_is_valid() -> None:
     assert tool.at(130.0) == 5.0 and tool.at(131.0) is None  # an answer keeps its age
 
 
+def test_an_older_length_replaces_none_that_is_valid() -> None:
+    tool, clock = ToolLength("vmc-07"), lambda: 30_000_000_000
+    assert tool.receive(0.0, length(80.0, time_utc_ns=30_000_000_000), utc_ns=clock)
+    older = length(50.0, time_utc_ns=29_000_000_000)
+    assert not tool.receive(1.0, older, utc_ns=clock) and tool.at(2.0) == 80.0
+    assert [reason.code for reason in tool.reasons] == ["replayed"] and "1.0 s older" in tool.reasons[0].detail
+    # The other clock was set back: what comes once the last one has expired is used.
+    assert tool.receive(61.0, older, utc_ns=clock) and tool.at(62.0) == 50.0
+    # Without a clock nothing says which of both times is wrong.
+    assert tool.receive(70.0, length(80.0, time_utc_ns=10**18)) and tool.receive(71.0, length(60.0))
+
+
 @pytest.mark.parametrize(
     ("payload", "code"),
     [

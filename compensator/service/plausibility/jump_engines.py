@@ -126,7 +126,12 @@ class JumpEngines:
             run.estimate = run.engine.step(values["t_q_degc"], values["at_degc"], others)
 
     def feed(
-        self, state: JumpState, offered: Mapping[str, float], jumped: list[str], change_k: Mapping[str, float]
+        self,
+        state: JumpState,
+        offered: Mapping[str, float],
+        jumped: list[str],
+        change_k: Mapping[str, float],
+        least_k: float,
     ) -> Fed:
         """Return what the shifted engine is given: at its own zero, less the jump, or missing at a jump.
 
@@ -140,6 +145,8 @@ class JumpEngines:
             Channels that have jumped in this sample by their rate, or by what the engine expects.
         change_k : mapping of str to float
             By channel: part of the permitted change of a sample that the temperature itself makes, K.
+        least_k : float
+            Smallest jump that is looked for, K: from there on what is left of one after a return is another zero.
         """
         values: dict[str, float] = {}
         new: list[str] = []
@@ -155,9 +162,12 @@ class JumpEngines:
                 unsure = min(state.back.get(name, 0), BACK_SAMPLES)
                 is_back = _has_returned(difference, std, shift, state.first_k[name])
                 state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
+                if state.back[name] <= 1:
+                    is_part = is_back and abs(difference) > max(NEAR * std, least_k)
+                    state.left_k[name] = difference if is_part else 0.0
                 most = max((1 + unsure) * change_k[name], NEAR * std)
                 if is_back:
-                    values[name] = value
+                    values[name] = value - state.left_k.get(name, 0.0)
                 elif name in jumped and not state.is_suspect:
                     new.append(name)
                 elif is_unsteady(state):
@@ -269,7 +279,7 @@ def moves(state: JumpState, offered: Mapping[str, float], change_k: Mapping[str,
     )
 
 
-def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:
+def count_held(state: JumpState, engine: Engine, at_degc: float, least_k: float) -> None:
     """Count the samples for which AT is where the engine without it holds it: air that a door let in goes again.
 
     Parameters
@@ -280,10 +290,14 @@ def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:
         Engine of the compensation.
     at_degc : float
         Measured AT, °C.
+    least_k : float
+        Smallest jump that is looked for, K.
     """
     expected, std = expected_value(engine, "at_degc", NAN)
-    first_k = state.first_k.get("at_degc", NAN)
-    is_back = list(state.shifts_k) == ["at_degc"] and _has_returned(at_degc - expected, std, first_k, first_k)
+    first_k, difference = state.first_k.get("at_degc", NAN), at_degc - expected
+    # Air goes back little by little. A couple that is half pushed in jumps back, and part of the way.
+    is_air = abs(difference) <= least_k or state.shifts_k.get("at_degc") == first_k
+    is_back = is_air and list(state.shifts_k) == ["at_degc"] and _has_returned(difference, std, first_k, first_k)
     state.at_held = state.at_held + 1 if is_back else 0
 
 

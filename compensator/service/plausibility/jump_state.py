@@ -43,6 +43,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Log likelihood ratio of the believing over the shifted engine.
     back : dict of str to int
         Consecutive samples for which each channel has been back.
+    left_k : dict of str to float
+        By channel that is back: what is left of its jump, K; 0 where that is too little to be one.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
     last : dict of str to float
@@ -79,6 +81,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     samples: int = 0
     ratio: float = 0.0
     back: dict[str, int] = {}
+    left_k: dict[str, float] = {}
     at_held: int = 0
     y_for: int = 0
     y_against: int = 0

@@ -60,6 +60,8 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
     """
     needed = needed_samples(state)
     if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
+        if any(state.left_k.values()):
+            return (_settle if is_unsteady(state) else _keep_what_is_left)(engine, engines, state, offered)
         return _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
     if state.at_held >= needed and not state.was_used:
         return _accept(engine, state, offered, None, "has returned to where it was before")
@@ -69,6 +71,22 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
     if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
         return _settle(engine, engines, state, offered)
     return Judgement()
+
+
+def _keep_what_is_left(
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]
+) -> Judgement:
+    """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
+    used = {name: offered[name] for name in state.shifts_k if not state.left_k[name]}
+    state.shifts_k = {name: left for name, left in state.left_k.items() if left}
+    state.first_k, state.back, state.left_k = dict(state.shifts_k), {}, {}
+    engine.restore(engines.shifted.engine.snapshot())
+    engines.believe_from(engines.shifted.engine)
+    state.suspect()
+    then = "after most of its jump is gone, and is not used until its new value is confirmed"
+    return Judgement(
+        engines.shifted.estimate, [jump_note(name, left, then) for name, left in state.shifts_k.items()], used
+    )
 
 
 def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:

@@ -25,6 +25,9 @@ a channel that then reads otherwise than expected is *unconfirmed*: heat or air 
 It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
 one of them.
 
+A channel that returns by most of its jump, but not by all of it, has jumped by what is left (from `jump_min_k` on): its
+couple was pushed in halfway.
+
 A loose contact jumps again and again: it has no level that the shifted engine could follow, which goes without it. Of
 T_Q its expectation is soon too wide for a return to show. Once the channel has come to rest, for as long as it would
 have to be back, and where the shifted engine thinks possible, it is like a couple that was open: used again, and
@@ -84,6 +87,7 @@ class JumpWatch:
         self.is_on = config.guards.suspect_jumps
         least_k = config.guards.jump_min_k
         self._signs = JumpSigns(model, least_k) if least_k is not None else None
+        self._least_k = math.inf if least_k is None else least_k
         self._model = model
         period_min = model.period_s / 60.0
         self._change_k = {
@@ -157,6 +161,7 @@ class JumpWatch:
             shifts_k=dict(state.shifts_k),
             first_k=dict(state.first_k),
             back=dict(state.back),
+            left_k=dict(state.left_k),
             last=dict(state.last),
             unseen=dict(state.unseen),
         )
@@ -254,8 +259,8 @@ class JumpWatch:
         if engines is None:
             return Judgement()
         self._state.last |= {name: offered[name] for name in TEMPERATURES if not math.isnan(offered[name])}
-        fed = engines.feed(self._state, offered, jumped, self._change_k)
-        count_held(self._state, engine, offered["at_degc"])
+        fed = engines.feed(self._state, offered, jumped, self._change_k, self._least_k)
+        count_held(self._state, engine, offered["at_degc"], self._least_k)
         if fed.jumped and self._state.is_suspect:
             self._believe_anew(engine, engines, offered)
             self._state.start_evidence()
