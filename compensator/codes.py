@@ -155,7 +155,7 @@ class Reason(Code):
     )
     UNCONFIRMED_CHANNEL = (
         "unconfirmed_channel",
-        "Since a channel was missing it reads otherwise than expected: heat, air or its zero has changed; it is used.",
+        "A channel reads otherwise than expected: heat, air or its zero has changed; it is used.",
         "If nothing was done at that sensor, send resume; else send zero with the machine at rest.",
     )
     OUTSIDE_VALIDITY = (
@@ -1054,11 +1054,11 @@ SUFFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "Check the couple of AT and its plug; if it is right, send resume; if it was replaced, send zero.",
         ),
         f"{Reason.UNCONFIRMED_CHANNEL}:t_q_degc": (
-            "Since T_Q was missing it reads otherwise than expected: heat or its zero has changed; it is used.",
+            "T_Q reads otherwise than expected: heat or its zero has changed; it is used.",
             "If nothing was done at the couple of T_Q, send resume; else send zero with the machine at rest.",
         ),
         f"{Reason.UNCONFIRMED_CHANNEL}:at_degc": (
-            "Since AT was missing it reads otherwise than expected: the air or its zero has changed; it is used.",
+            "AT reads otherwise than expected: the air or its zero has changed; it is used.",
             "If nothing was done at the couple of AT, send resume; else send zero with the machine at rest.",
         ),
         f"{Reason.OUTSIDE_VALIDITY}:t_q_degc": (

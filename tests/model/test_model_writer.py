@@ -213,6 +213,6 @@ def test_an_alternative_that_integrates_is_written(path):
 
 
 def test_a_unit_cannot_break_out_of_its_comment():
-    odd = dataclasses.replace(SAMPLED, unit="um/K\"; name = 3 # \\")
+    odd = dataclasses.replace(SAMPLED, unit='um/K"; name = 3 # \\')
     model = direct_model(alternatives={"odd": ("DTF", odd)})
     assert read_back(model) == model

@@ -81,7 +81,7 @@ def events(outcomes: list[Outcome], code: str) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("channel", "size"), [("t_q_degc", 8.0), ("t_q_degc", -8.0), ("t_q_degc", 3.5), ("at_degc", -5.0), ("at_degc", 1.6)]
+    ("channel", "size"), [("t_q_degc", 8.0), ("t_q_degc", -8.0), ("t_q_degc", 3.5), ("at_degc", -5.0)]
 )
 def test_a_jump_is_never_ok_and_its_mend_makes_the_offset_right_at_once(
     day: dict[str, np.ndarray], channel: str, size: float
@@ -118,22 +118,29 @@ def test_a_couple_that_is_pushed_in_halfway_is_never_ok_while_it_is_wrong(
     assert outcomes[END + 30].offset.state == "hold" and not events(outcomes, "accepted")
 
 
-@pytest.mark.parametrize("size", [5.0, -5.0])
+@pytest.mark.parametrize(("size", "samples"), [(1.6, 1), (-1.6, 1), (5.0, 3), (-5.0, 3)])
 @pytest.mark.parametrize("end", [BEGIN + 30, END])
-def test_air_that_jumps_in_three_samples_is_right_again_at_once_after_its_mend(
-    day: dict[str, np.ndarray], size: float, end: int
+def test_air_that_moves_while_t_q_does_not_is_used_and_its_deviation_says_so(
+    day: dict[str, np.ndarray], size: float, samples: int, end: int
 ) -> None:
-    """Suspect from its first step on; the further ones are no loose contact, and what returns is all of them."""
+    """Within the permitted rate it is a door, which T_Q of a heavy machine follows late, or the sensor."""
 
     def change(i: int, values: dict[str, float]) -> None:
         if BEGIN <= i < end:
-            values["at_degc"] += size * min((i - BEGIN + 1) / 3.0, 1.0)
+            values["at_degc"] += size * min((i - BEGIN + 1) / samples, 1.0)
 
     outcomes = run(day, change)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
-    assert all("suspect_channel:at_degc" in o.offset.reasons for o in outcomes[BEGIN + 1 : end])
-    assert events(outcomes, "accepted") == [end + 2]
-    assert not np.any(wrong[end + 12 :]) and outcomes[-1].offset.state == "ok"
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    during = outcomes[BEGIN:end]
+    assert all("unconfirmed_channel:at_degc" in o.offset.reasons for o in during)
+    assert not any("suspect_channel:at_degc" in o.offset.reasons for o in during)
+    stds = np.array([number(o.offset.y_offset_std_um) for o in outcomes])
+    # A T_Q far below AT is held for some minutes; the offset then comes back at its permitted rate.
+    is_told = np.array([o.offset.state != "hold" and "rate_limited" not in o.offset.reasons for o in outcomes])
+    assert np.all((apart < 1.6 * stds)[BEGIN + 6 : end] | ~is_told[BEGIN + 6 : end]) and sum(is_told[BEGIN:end]) > 10
+    assert not np.any(apart[end + 12 :] > 5.0) and outcomes[-1].offset.state == "ok"
+    if samples == 1:  # it may have been air: degraded for as long as that would matter
+        assert outcomes[end + 3].offset.state == "degraded"
 
 
 @pytest.mark.parametrize("size", [8.0, -8.0])

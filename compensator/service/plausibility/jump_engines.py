@@ -163,7 +163,9 @@ class JumpEngines:
                 is_back = _has_returned(difference, std, shift, state.first_k[name])
                 state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
                 if state.back[name] <= 1:
-                    is_part = is_back and abs(difference) > max(NEAR * std, least_k)
+                    # How far it has jumped was as uncertain as what was expected then.
+                    exact_k = math.hypot(std, state.shift_std_k.get(name, 0.0))
+                    is_part = is_back and abs(difference) > max(NEAR * exact_k, least_k)
                     state.left_k[name] = difference if is_part else 0.0
                 most = max((1 + unsure) * change_k[name], NEAR * std)
                 if is_back:
@@ -186,6 +188,7 @@ class JumpEngines:
                 values[name] = value
             if name in new:
                 state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
+                state.shift_std_k[name] = std
                 # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect
                 # channel that had come to rest has jumped again.
                 first_k = state.first_k.get(name, difference)
@@ -238,6 +241,15 @@ class JumpEngines:
                     cost += sign * 2.0 * math.log(std)
         keep = _KEEP if state.is_suspect else 1.0
         state.ratio = keep * state.ratio + cost
+
+    def swap(self) -> None:
+        """Believe what the shifted engine expected: the other one is the doubt from here on."""
+        self.believing, self.shifted = self.shifted, self.believing
+
+    def agree(self) -> bool:
+        """Return whether both predict the same, within the standard deviation of one."""
+        one, other = self.believing.estimate, self.shifted.estimate
+        return one is not None and other is not None and abs(one.y_um - other.y_um) <= one.y_std_um
 
     def speaks(self, y_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.

@@ -80,11 +80,11 @@ def jump_note(name: str, shift_k: float, then: str = "and is not used until its 
     )
 
 
-def unconfirmed_note(name: str, shift_k: float) -> Note:
-    """Return the event that a channel may have jumped while nobody saw it."""
+def unconfirmed_note(name: str, shift_k: float, when: str = "after samples without it") -> Note:
+    """Return the event that a channel may have jumped, and that nobody saw whether it has."""
     return Note(
         EventKind.PLAUSIBILITY,
-        f"{NAMES[name]} reads {shift_k:+.2f} K other than expected after samples without it; it is used, but nothing "
-        "confirms that the sensor has kept its zero",
+        f"{NAMES[name]} reads {shift_k:+.2f} K other than expected {when}; it is used, but nothing confirms that the "
+        "sensor has kept its zero",
         {"code": Implausibility.UNCONFIRMED, "channel": name, "shift_k": shift_k},
     )

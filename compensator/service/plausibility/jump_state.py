@@ -27,6 +27,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Mean of measured Y − prediction over the last samples, µm: what a jump is compared with.
     shifts_k : dict of str to float
         By channel that has jumped: measured − expected, K. Empty if none has.
+    shift_std_k : dict of str to float
+        Standard deviation of what was expected at their last jumps, K.
     first_k : dict of str to float
         The first jump of each of them, K.
     steps : int
@@ -52,7 +54,9 @@ class JumpState(msgspec.Struct, kw_only=True):
     unseen : dict of str to int
         By channel: samples since its last value.
     is_unconfirmed : bool
-        Whether these channels read otherwise than expected after samples without them; they are used meanwhile.
+        Whether these channels read otherwise than expected, after samples without them or as `is_air`; they are used.
+    is_air : bool
+        Whether AT alone has moved within its permitted rate, and T_Q has not followed.
     was_used : bool
         Whether they were used like that until they jumped again: the compensation's engine knows what they showed.
     age, loose : int
@@ -67,12 +71,14 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     level_um: float = NAN
     shifts_k: dict[str, float] = {}
+    shift_std_k: dict[str, float] = {}
     first_k: dict[str, float] = {}
     steps: int = 0
     again: int = 0
     quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
     is_unconfirmed: bool = False
+    is_air: bool = False
     was_used: bool = False
     age: int = 0
     loose: int = 0
@@ -97,7 +103,7 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def suspect(self, *, was_used: bool = False) -> None:
         """Use the channels no longer that were watched or unconfirmed."""
-        self.is_suspect, self.is_unconfirmed, self.was_used = True, False, was_used
+        self.is_suspect, self.is_unconfirmed, self.is_air, self.was_used = True, False, False, was_used
         self.start_evidence()
 
     def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:

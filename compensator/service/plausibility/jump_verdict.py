@@ -44,6 +44,11 @@ class Judgement(msgspec.Struct, frozen=True):
     ends: bool = False
 
 
+def is_watched(state: JumpState) -> bool:
+    """Return whether further moves may belong to a jump within the permitted rate."""
+    return not state.is_suspect and (not state.is_unconfirmed or (state.is_air and state.samples < WATCHED_SAMPLES))
+
+
 def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
     """Decide whether channels that are not used are used again, and from which engine on.
 
@@ -127,21 +132,34 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     engine, engines, state, offered
         As `suspected` has them.
     """
-    shifted = engines.shifted
-    is_refuted = is_unlikely(state)
+    is_refuted, only_at = is_unlikely(state), list(state.shifts_k) == ["at_degc"]
+    is_back = all(state.back.get(name, 0) > 0 for name in state.shifts_k)
+    if only_at and is_refuted and not is_back and not state.is_unconfirmed:
+        state.is_unconfirmed = state.is_air = True
+        return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], "and T_Q does not follow")])
+    # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
+    is_refuted &= is_back or not state.is_air
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
             return _accept(engine, state, offered, None, f"is confirmed: {by} with it")
+        if only_at and state.back.get("at_degc", 0) >= needed_samples(state) and engines.agree():
+            return _accept(engine, state, offered, None, "has returned to what was expected before")
         # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
         is_refuted |= is_contradicted(state) and not is_unsteady(state)
     if is_refuted:
-        engine.restore(shifted.engine.snapshot())
-        estimate = shifted.estimate
-        if all(state.back.get(name, 0) > 0 for name in state.shifts_k):
-            notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
+        engine.restore(engines.shifted.engine.snapshot())
+        estimate = engines.shifted.estimate
+        if not is_back:
+            notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
+            state.suspect()
+            return Judgement(estimate, notes)
+        notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
+        if not only_at or engines.agree():
             return Judgement(estimate, notes, ends=True)
-        notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
-        state.suspect()
+        # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
+        engines.swap()
+        state.is_unconfirmed = state.is_air = True
+        state.start_evidence()
         return Judgement(estimate, notes)
     return Judgement(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)

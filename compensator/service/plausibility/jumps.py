@@ -25,6 +25,10 @@ a channel that then reads otherwise than expected is *unconfirmed*: heat or air 
 It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
 one of them.
 
+AT that moves within the permitted rate while T_Q does not follow is *unconfirmed*, too, not suspect: T_Q follows the
+air as slowly as the machine does, and a door looks like that. Once AT has returned, what the shifted engine expected is
+believed if T_Q has spoken for it, and the other answer is the doubt, until both agree.
+
 A channel that returns by most of its jump, but not by all of it, has jumped by what is left (from `jump_min_k` on): its
 couple was pushed in halfway.
 
@@ -72,7 +76,7 @@ from compensator.service.plausibility.jump_evidence import (
 )
 from compensator.service.plausibility.jump_signs import JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
-from compensator.service.plausibility.jump_verdict import Judgement, suspected, watched
+from compensator.service.plausibility.jump_verdict import Judgement, is_watched, suspected, watched
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
@@ -159,6 +163,7 @@ class JumpWatch:
             believing=None,
             shifted=None,
             shifts_k=dict(state.shifts_k),
+            shift_std_k=dict(state.shift_std_k),
             first_k=dict(state.first_k),
             back=dict(state.back),
             left_k=dict(state.left_k),
@@ -253,7 +258,7 @@ class JumpWatch:
             jumped = [*hidden, *(name for name in self._signs.watchable(engine, offered) if name not in hidden)]
             if jumped:
                 self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
-        elif self._engines is not None and self._signs is not None and not self.suspects and not self.unconfirmed:
+        elif self._engines is not None and self._signs is not None and is_watched(self._state):
             jumped = self._going_on(self._signs, self._engines, offered)
         engines = self._engines
         if engines is None:
