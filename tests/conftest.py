@@ -21,8 +21,9 @@ from tests.shared_folder import search_once
 one_thread_from_start()
 # A shell starts what runs in the background with SIGINT ignored, and so would every program that a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-# The same draws in every run. `pytest --hypothesis-profile default` draws others each time, to find what these miss.
-settings.register_profile("fixed", derandomize=True, database=None)
+# The same draws in every run, and no deadline by the clock. `pytest --hypothesis-profile default` draws others each
+# time, to find what these miss.
+settings.register_profile("fixed", derandomize=True, database=None, deadline=None)
 settings.load_profile("fixed")
 
 

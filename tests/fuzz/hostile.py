@@ -35,7 +35,7 @@ from tests.fuzz.mutation import mutated
 from tests.fuzz.payloads import number
 
 #: No input may take longer, s, on a busy computer either.
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 QUILL = read_model_bytes("quill")
 TABLE = b"t_s,t_q_degc,at_degc,y_um,heat_w\n" + b"".join(
     f"{60 * i},{20 + 0.01 * i:.2f},20.1,{0.02 * i:.3f},{30 if i > 20 else 0}\n".encode() for i in range(150)
