@@ -542,10 +542,16 @@ def test_a_direct_model_keeps_a_suspect_until_an_operator_decides(day: dict[str,
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN:END])
 
 
-def test_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray]) -> None:
+@pytest.mark.parametrize(
+    ("channel", "size", "left"), [("t_q_degc", -3.5, 0.0), ("at_degc", 1.6, 0.0), ("at_degc", 8.0, 1.4)]
+)
+def test_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray], channel: str, size: float, left: float) -> None:
     conf = settings()
     whole = Compensation(conf, QUILL)
-    change = biased("t_q_degc", -3.5, 250, 330)
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values[channel] += size if 250 <= i < 330 else left * (i >= 330)
+
     for i in range(200, 360):
         values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
         change(i, values)

@@ -82,7 +82,7 @@ def _keep_what_is_left(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]
 ) -> Judgement:
     """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
-    used = {name: offered[name] for name in state.shifts_k if not state.left_k[name]}
+    used = {name: offered[name] for name in state.shifts_k if not state.left_k.get(name)}
     state.shifts_k = {name: left for name, left in state.left_k.items() if left}
     state.first_k, state.back, state.left_k = dict(state.shifts_k), {}, {}
     engine.restore(engines.shifted.engine.snapshot())
