@@ -62,12 +62,13 @@ class ToolLength:
         bool
             Whether it is now the newest length.
         """
-        if asked and self._time_utc_ns is not None:
+        is_valid = self._time_utc_ns is not None and now_s <= self._until_s
+        if asked and is_valid:
             return False
         try:
             length_mm, until_s, time_utc_ns = self._parse(now_s, payload, utc_ns)
             # Without a wall clock a time may be a forged one of next year, and nothing would replace it.
-            last_ns = self._time_utc_ns if utc_ns is not None and now_s <= self._until_s else None
+            last_ns = self._time_utc_ns if utc_ns is not None and (is_valid or asked) else None
             if last_ns is not None and time_utc_ns < last_ns:
                 raise Rejected(Reason("replayed", f"{(last_ns - time_utc_ns) / 1e9:.1f} s older than the last"))
         except Rejected as rejected:

@@ -36,13 +36,13 @@ def day() -> dict[str, np.ndarray]:
     return World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 3).record(60.0)
 
 
-def settings(checks: dict[str, float] | None = None, **guards: Any) -> Any:
+def settings(checks: dict[str, float] | None = None, channel: Any = CHANNELS, **guards: Any) -> Any:
     limits = TABLE["limits"] | {
         "offset_rate_max_um_per_min": 20.0,
         "validity": {"t_q_degc": [0, 90], "at_degc": [0, 60]},
     }
     plausibility = {"t_q_below_at_after_min": 15.0, "residual_std_um": 0.3} | (checks or {})
-    return config(channel=CHANNELS, guards=GUARDS | guards, limits=limits, plausibility=plausibility)
+    return config(channel=channel, guards=GUARDS | guards, limits=limits, plausibility=plausibility)
 
 
 def run(
@@ -52,9 +52,10 @@ def run(
     *,
     y: bool = False,
     model: Any = QUILL,
+    channel: Any = CHANNELS,
     **guards: Any,
 ) -> list[Outcome]:
-    compensation, outcomes = Compensation(settings(**guards), model), []
+    compensation, outcomes = Compensation(settings(channel=channel, **guards), model), []
     for i in range(len(day["t_s"])):
         values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
         change(i, values)
@@ -141,6 +142,59 @@ def test_air_that_moves_while_t_q_does_not_is_used_and_its_deviation_says_so(
     assert not np.any(apart[end + 12 :] > 5.0) and outcomes[-1].offset.state == "ok"
     if samples == 1:  # it may have been air: degraded for as long as that would matter
         assert outcomes[end + 3].offset.state == "degraded"
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4])
+@pytest.mark.parametrize("size", [1.7, -1.7])
+def test_a_door_that_closes_slowly_is_closed(day: dict[str, np.ndarray], size: float, samples: int) -> None:
+    def door(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += size * min(max((END + samples - 1 - i) / samples, 0.0), 1.0) * (i >= BEGIN)
+
+    outcomes = run(day, door)
+    assert "unconfirmed_channel:at_degc" in outcomes[END - 1].offset.reasons
+    assert {o.offset.state for o in outcomes[END + 90 :]} == {"ok"}
+    assert not any("suspect_channel:at_degc" in o.offset.reasons for o in outcomes)
+
+
+def both_jump(i: int, values: dict[str, float]) -> None:
+    values["t_q_degc"] += 8.0 if BEGIN <= i < END else 0.0
+    values["at_degc"] = math.nan if BEGIN + 20 <= i < BEGIN + 32 else values["at_degc"] - 4.0 * (i >= BEGIN + 32)
+
+
+def twice(i: int, values: dict[str, float]) -> None:
+    values["t_q_degc"] += {BEGIN: 4.0, BEGIN + 1: 12.0, BEGIN + 2: 12.0}.get(i, 0.0)
+
+
+def one_after_the_other(i: int, values: dict[str, float]) -> None:
+    values["t_q_degc"] += 4.0 if i >= BEGIN else 0.0
+    values["at_degc"] -= 6.0 if i > BEGIN else 0.0
+
+
+@pytest.mark.parametrize(("change", "ends"), [(both_jump, "hold"), (twice, "ok"), (one_after_the_other, "hold")])
+def test_a_jump_beside_another_one_is_never_ok_while_it_is_wrong(
+    day: dict[str, np.ndarray], change: Change, ends: str
+) -> None:
+    outcomes = run(day, change)
+    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes[: BEGIN + 300]) if i > BEGIN + 1)
+    assert outcomes[BEGIN + 250].offset.state == ends
+
+
+def test_what_is_left_of_a_jump_that_was_within_the_permitted_rate_is_not_believed(day: dict[str, np.ndarray]) -> None:
+    """Where AT may change by 20 K/min, only T_Q, which does not follow, shows the jump."""
+    channels = [c | {"rate_max_per_min": 20.0} if c["name"] == "at_degc" else c for c in CHANNELS]
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += 8.0 if BEGIN <= i < END else 1.5 * (i >= END)
+
+    outcomes = run(day, change, channel=channels)
+    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
+
+
+def test_a_pause_is_no_sample_of_a_return(day: dict[str, np.ndarray]) -> None:
+    outcomes = run(day, biased("t_q_degc", 8.0), lambda i, c: c.pause(2) if i == END + 2 else None)
+    assert events(outcomes, "accepted") == [END + 4]
 
 
 @pytest.mark.parametrize("size", [8.0, -8.0])

@@ -22,6 +22,8 @@ BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
 _MOST_STEPS = 2
 #: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
 _UNSTEADY = 2
+#: Samples for which AT may be on its way back from a jump within the permitted rate; then it has another level.
+_MOST_MOVING = 10
 #: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
 UNSEEN_SAMPLES = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
@@ -160,7 +162,10 @@ class JumpEngines:
                 shift = state.shifts_k[name]
                 # A heat that is switched may bring it back for a moment.
                 unsure = min(state.back.get(name, 0), BACK_SAMPLES)
-                is_back = _has_returned(difference, std, shift, state.first_k[name])
+                if state.is_air:  # AT on its way back widens what is expected, not where it was
+                    is_back = shift == 0.0 or abs(difference) <= _RETURNED * abs(shift)
+                else:
+                    is_back = _has_returned(difference, std, shift, state.first_k[name])
                 state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
                 if state.back[name] <= 1:
                     # How far it has jumped was as uncertain as what was expected then.
@@ -169,17 +174,23 @@ class JumpEngines:
                     state.left_k[name] = difference if is_part else 0.0
                 most = max((1 + unsure) * change_k[name], NEAR * std)
                 if is_back:
-                    values[name] = value - state.left_k.get(name, 0.0)
+                    values[name], state.moving = value - state.left_k.get(name, 0.0), 0
                 elif name in jumped and not state.is_suspect:
                     new.append(name)
                 elif is_unsteady(state):
                     values[name] = NAN
+                elif state.is_air and difference / shift < 1.0 - _RETURNED:
+                    # A door closes: where AT comes to rest says whether it is back.
+                    state.moving += 1
+                    values[name] = NAN
+                    if state.moving > _MOST_MOVING:
+                        state.shifts_k[name], state.moving = difference, 0
                 elif abs(difference - shift) <= most or not state.is_suspect:
-                    values[name] = value - shift
+                    values[name], state.moving = value - shift, 0
                 else:
                     new.append(name)
                     same_way = (difference - shift) * shift > 0.0
-                    goes_on = same_way and state.samples <= 1 and state.steps < _MOST_STEPS
+                    goes_on = same_way and state.samples == 1 and state.steps < _MOST_STEPS
                     state.steps += goes_on
                     state.again += not goes_on
             elif name in jumped:
@@ -232,7 +243,7 @@ class JumpEngines:
         cost = 0.0
         for run, values, sign in ((self.believing, offered, -0.5), (self.shifted, fed.values, 0.5)):
             for name in TEMPERATURES:
-                if name in fed.jumped or math.isnan(values[name]):
+                if name in fed.jumped or math.isnan(fed.values[name]):
                     continue
                 expected, std = expected_value(run.engine, name, values["at_degc"])
                 cost += sign * min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP)
@@ -275,7 +286,7 @@ class JumpEngines:
 
 def is_unsteady(state: JumpState) -> bool:
     """Return whether the channels that have jumped are those of a loose contact: the shifted engine goes without."""
-    return state.again >= _UNSTEADY and (state.is_suspect or state.is_unconfirmed)
+    return state.again >= _UNSTEADY and not state.is_air and (state.is_suspect or state.is_unconfirmed)
 
 
 def needed_samples(state: JumpState) -> int:
@@ -328,7 +339,7 @@ def shifts_against(engine: Engine, state: JumpState) -> dict[str, float]:
 def _has_returned(difference: float, std: float, shift: float, first: float) -> bool:
     near = max(NEAR * std, _RETURNED * abs(shift))
     # Where the expectation itself is uncertain by the size of the jump, a return shows nothing.
-    return abs(difference) <= near <= _RETURNED_MOST * abs(first)
+    return abs(difference) <= near <= _RETURNED_MOST * max(abs(first), abs(shift))
 
 
 def _new_run(model: ThermalModel) -> Run:

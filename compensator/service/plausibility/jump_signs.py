@@ -16,6 +16,9 @@ _BEYOND = 0.2
 #: Standard deviations of the innovation that such a jump exceeds in any case.
 _JUMP = 6.0
 
+#: Since when, and why, a channel is unconfirmed.
+UNSEEN, RESTED, AIR = "after samples without it", "now that it is at rest", "and T_Q does not follow"
+
 NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
 
 
@@ -80,7 +83,7 @@ def jump_note(name: str, shift_k: float, then: str = "and is not used until its 
     )
 
 
-def unconfirmed_note(name: str, shift_k: float, when: str = "after samples without it") -> Note:
+def unconfirmed_note(name: str, shift_k: float, when: str) -> Note:
     """Return the event that a channel may have jumped, and that nobody saw whether it has."""
     return Note(
         EventKind.PLAUSIBILITY,

@@ -47,6 +47,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Consecutive samples for which each channel has been back.
     left_k : dict of str to float
         By channel that is back: what is left of its jump, K; 0 where that is too little to be one.
+    moving : int
+        Consecutive samples for which AT of `is_air` has been on its way back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
     last : dict of str to float
@@ -88,6 +90,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     ratio: float = 0.0
     back: dict[str, int] = {}
     left_k: dict[str, float] = {}
+    moving: int = 0
     at_held: int = 0
     y_for: int = 0
     y_against: int = 0
@@ -95,6 +98,17 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
+
+    def keep_what_is_left(self) -> None:
+        """Go on with what is left of the jumps of the channels that are back; of AT alone even if that is nothing."""
+        left_k = {name: left for name, left in self.left_k.items() if left}
+        self.shifts_k = left_k or dict.fromkeys(self.shifts_k, 0.0)
+        self.first_k, self.left_k = dict(self.shifts_k), {}
+        self.start_counts()
+
+    def start_counts(self) -> None:
+        """Count consecutive samples from here on."""
+        self.back, self.at_held, self.moving = {}, 0, 0
 
     def start_evidence(self) -> None:
         """Count the evidence from here on."""
@@ -108,9 +122,10 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:
         """Return the state when a channel has jumped, or may have while it was not seen."""
-        again = self.again + 1 if self.quiet < FORGOTTEN_SAMPLES else 0
+        again = self.again + is_suspect if self.quiet < FORGOTTEN_SAMPLES else 0
         return JumpState(
             level_um=self.level_um,
+            quiet=self.quiet,
             is_suspect=is_suspect,
             is_unconfirmed=is_unconfirmed,
             unseen=self.unseen,

@@ -16,7 +16,7 @@ from compensator.service.plausibility.jump_engines import (
     needed_samples,
 )
 from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_unlikely
-from compensator.service.plausibility.jump_signs import NAMES, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import AIR, NAMES, RESTED, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import JumpState
 
 #: A jump within the permitted rate is watched for this number of samples.
@@ -83,8 +83,7 @@ def _keep_what_is_left(
 ) -> Judgement:
     """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
     used = {name: offered[name] for name in state.shifts_k if not state.left_k.get(name)}
-    state.shifts_k = {name: left for name, left in state.left_k.items() if left}
-    state.first_k, state.back, state.left_k = dict(state.shifts_k), {}, {}
+    state.keep_what_is_left()
     engine.restore(engines.shifted.engine.snapshot())
     engines.believe_from(engines.shifted.engine)
     state.suspect()
@@ -100,7 +99,7 @@ def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     for name in state.shifts_k:
         expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
         state.shifts_k[name] = offered[name] - expected
-        notes.append(unconfirmed_note(name, state.shifts_k[name]))
+        notes.append(unconfirmed_note(name, state.shifts_k[name], RESTED))
     engine.restore(engines.believing.engine.snapshot())
     state.is_suspect, state.is_unconfirmed = False, True
     state.samples, state.ratio = 0, 0.0
@@ -136,15 +135,18 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     is_back = all(state.back.get(name, 0) > 0 for name in state.shifts_k)
     if only_at and is_refuted and not is_back and not state.is_unconfirmed:
         state.is_unconfirmed = state.is_air = True
-        return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], "and T_Q does not follow")])
+        return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
     # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
     is_refuted &= is_back or not state.is_air
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
             return _accept(engine, state, offered, None, f"is confirmed: {by} with it")
-        if only_at and state.back.get("at_degc", 0) >= needed_samples(state) and engines.agree():
-            return _accept(engine, state, offered, None, "has returned to what was expected before")
+        if only_at and state.back.get("at_degc", 0) >= needed_samples(state):
+            if state.left_k.get("at_degc"):
+                state.keep_what_is_left()
+            elif engines.agree():
+                return _accept(engine, state, offered, None, "has returned to what was expected before")
         # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
         is_refuted |= is_contradicted(state) and not is_unsteady(state)
     if is_refuted:
@@ -154,11 +156,14 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
             notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
             state.suspect()
             return Judgement(estimate, notes)
+        if any(state.left_k.values()) and not only_at:
+            return _keep_what_is_left(engine, engines, state, offered)
         notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
-        if not only_at or engines.agree():
+        if not only_at or (engines.agree() and not any(state.left_k.values())):
             return Judgement(estimate, notes, ends=True)
         # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
         engines.swap()
+        state.keep_what_is_left()
         state.is_unconfirmed = state.is_air = True
         state.start_evidence()
         return Judgement(estimate, notes)

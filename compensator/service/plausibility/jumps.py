@@ -74,7 +74,7 @@ from compensator.service.plausibility.jump_evidence import (
     weigh_probe,
     weigh_y,
 )
-from compensator.service.plausibility.jump_signs import JumpSigns, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import AIR, UNSEEN, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
 from compensator.service.plausibility.jump_verdict import Judgement, is_watched, suspected, watched
 
@@ -180,6 +180,7 @@ class JumpWatch:
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._state.unseen = {} if held else {name: self._state.unseen.get(name, 0) + samples for name in TEMPERATURES}
+        self._state.start_counts()
         if self._engines is not None:
             self._engines.pass_time(samples, held=held)
 
@@ -249,7 +250,7 @@ class JumpWatch:
         if self._engines is not None and is_unsteady(self._state) and set(jumped) <= set(self._state.shifts_k):
             if jumped or moves(self._state, offered, self._change_k):
                 notes += self._unsettle(engine, self._engines, offered)
-        elif self._engines is not None and jumped and self._state.is_unconfirmed:
+        elif self._engines is not None and jumped and not self._state.is_suspect:
             self._use_no_longer(engine, self._engines, offered)
         elif jumped and not self._state.is_suspect:
             self._begin(engine, self._state.begun(is_suspect=True))
@@ -260,6 +261,9 @@ class JumpWatch:
                 self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
         elif self._engines is not None and self._signs is not None and is_watched(self._state):
             jumped = self._going_on(self._signs, self._engines, offered)
+        if self._state.shifts_k and self._signs is not None:
+            beside = [name for name in self._signs.unexpected(engine, offered, seen_again) if name not in jumped]
+            jumped = [*jumped, *(name for name in beside if name not in self._state.shifts_k)]
         engines = self._engines
         if engines is None:
             return Judgement()
@@ -271,7 +275,8 @@ class JumpWatch:
             self._state.start_evidence()
             notes += [jump_note(name, self._state.shifts_k[name]) for name in jumped if name in fed.jumped]
         elif fed.jumped and self._state.is_unconfirmed:
-            notes += [unconfirmed_note(name, self._state.shifts_k[name]) for name in fed.jumped]
+            when = AIR if self._state.is_air else UNSEEN
+            notes += [unconfirmed_note(name, self._state.shifts_k[name], when) for name in fed.jumped]
         engines.weigh(self._state, offered, fed)
         engines.step(offered, fed, others)
         self._state.samples += 1
@@ -328,9 +333,9 @@ class JumpWatch:
         return (used, other) if used is not None and other is not None else None
 
     def _use_no_longer(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
-        """Suspect unconfirmed channels that jump again: what they have shown is kept if nothing contradicts it."""
+        """Suspect channels that jump again: what unconfirmed ones have shown is kept if nothing contradicts it."""
         state = self._state
-        was_used = state.age - state.loose > state.loose and not is_contradicted(state)
+        was_used = state.is_unconfirmed and state.age - state.loose > state.loose and not is_contradicted(state)
         if was_used:
             state.age = 0
         else:
@@ -358,7 +363,7 @@ class JumpWatch:
             state.start_evidence()
             return []
         self._use_no_longer(engine, engines, offered)
-        return [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
+        return [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if not math.isnan(offered[name])]
 
     def _going_on(self, signs: JumpSigns, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
         """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
