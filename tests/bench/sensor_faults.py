@@ -192,8 +192,8 @@ def doors(seeds):
     yield told(
         Figure(
             what=f"{len(seeds)} doors of 1 to 4 K: AT asked about; still so in the evening; held for an hour",
-            found=f"{raised}; {asked}; {held}; in ok more than {WRONG_UM:g} um from an offset that believes the air: {wrong} "
-            f"for more than 3 min, most {most:.1f} um",
+            found=f"{raised}; {asked}; {held}; in ok more than {WRONG_UM:g} um from an offset that believes the air: "
+            f"{wrong} for more than 3 min, most {most:.1f} um",
             wanted="none held",
         )
     )
