@@ -11,7 +11,7 @@ import pytest
 
 from sim_hardware.wire import Rack
 
-PATIENCE_S = 2.0
+PATIENCE_S = 10.0
 
 
 class Wire:

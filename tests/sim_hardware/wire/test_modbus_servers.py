@@ -169,7 +169,9 @@ def test_rtu_line_is_silent_to_strangers_and_garbled_frames(rack, wires):
     wire.send(rtu("030300000001"))
     wire.send(rtu(READ_ONE)[:-1] + b"\0")
     assert wire.receive(1, within_s=0.1) == b""
-    assert wire.ask(rtu("020300000001"), 7) == rtu("020302199a").hex()
+    # On a busy computer the line may not have read these yet, and takes them and the next request for one frame.
+    answers = (wire.ask(rtu("020300000001"), 7) for _ in range(3))
+    assert next(filter(None, answers)) == rtu("020302199a").hex()
     assert wire.ask(rtu(READ_ONE), 7) == rtu("0103020404").hex()
 
 
