@@ -22,8 +22,8 @@ BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
 _MOST_STEPS = 2
 #: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
 _UNSTEADY = 2
-#: Samples for which AT may be on its way back from a jump within the permitted rate; then it has another level.
-_MOST_MOVING = 10
+#: Samples for which AT may be on its way back from a jump within the permitted rate; slower moves are the air's.
+_MOST_MOVING = 3
 #: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
 UNSEEN_SAMPLES = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
@@ -163,14 +163,12 @@ class JumpEngines:
                 # A heat that is switched may bring it back for a moment.
                 unsure = min(state.back.get(name, 0), BACK_SAMPLES)
                 if state.is_air:  # AT on its way back widens what is expected, not where it was
-                    is_back = shift == 0.0 or abs(difference) <= _RETURNED * abs(shift)
+                    is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
                 else:
                     is_back = _has_returned(difference, std, shift, state.first_k[name])
                 state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
                 if state.back[name] <= 1:
-                    # How far it has jumped was as uncertain as what was expected then.
-                    exact_k = math.hypot(std, state.shift_std_k.get(name, 0.0))
-                    is_part = is_back and abs(difference) > max(NEAR * exact_k, least_k)
+                    is_part = is_back and abs(difference) > max(0.0 if state.is_air else NEAR * std, least_k)
                     state.left_k[name] = difference if is_part else 0.0
                 most = max((1 + unsure) * change_k[name], NEAR * std)
                 if is_back:
@@ -179,12 +177,9 @@ class JumpEngines:
                     new.append(name)
                 elif is_unsteady(state):
                     values[name] = NAN
-                elif state.is_air and difference / shift < 1.0 - _RETURNED:
+                elif state.is_air and shift and difference / shift < 1.0 - _RETURNED and state.moving < _MOST_MOVING:
                     # A door closes: where AT comes to rest says whether it is back.
-                    state.moving += 1
-                    values[name] = NAN
-                    if state.moving > _MOST_MOVING:
-                        state.shifts_k[name], state.moving = difference, 0
+                    values[name], state.moving = NAN, state.moving + 1
                 elif abs(difference - shift) <= most or not state.is_suspect:
                     values[name], state.moving = value - shift, 0
                 else:
@@ -200,6 +195,7 @@ class JumpEngines:
             if name in new:
                 state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
                 state.shift_std_k[name] = std
+                state.is_swapped = False
                 # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect
                 # channel that had come to rest has jumped again.
                 first_k = state.first_k.get(name, difference)

@@ -18,6 +18,7 @@ _JUMP = 6.0
 
 #: Since when, and why, a channel is unconfirmed.
 UNSEEN, RESTED, AIR = "after samples without it", "now that it is at rest", "and T_Q does not follow"
+BESIDE, LEFT = "while another channel is in question", "after most of its jump is gone"
 
 NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
 

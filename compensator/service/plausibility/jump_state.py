@@ -59,6 +59,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Whether these channels read otherwise than expected, after samples without them or as `is_air`; they are used.
     is_air : bool
         Whether AT alone has moved within its permitted rate, and T_Q has not followed.
+    is_swapped : bool
+        Whether AT of `is_air` has returned, and the shifted engine is the one that has believed it meanwhile.
     was_used : bool
         Whether they were used like that until they jumped again: the compensation's engine knows what they showed.
     age, loose : int
@@ -81,6 +83,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     is_suspect: bool = False
     is_unconfirmed: bool = False
     is_air: bool = False
+    is_swapped: bool = False
     was_used: bool = False
     age: int = 0
     loose: int = 0
@@ -117,7 +120,8 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def suspect(self, *, was_used: bool = False) -> None:
         """Use the channels no longer that were watched or unconfirmed."""
-        self.is_suspect, self.is_unconfirmed, self.is_air, self.was_used = True, False, False, was_used
+        self.is_suspect, self.is_unconfirmed, self.was_used = True, False, was_used
+        self.is_air = self.is_swapped = False
         self.start_evidence()
 
     def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:

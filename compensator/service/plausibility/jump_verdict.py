@@ -9,6 +9,7 @@ import msgspec
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.engine import Engine, Estimate
 from compensator.service.plausibility.jump_engines import (
+    NEAR,
     JumpEngines,
     Run,
     expected_value,
@@ -16,7 +17,7 @@ from compensator.service.plausibility.jump_engines import (
     needed_samples,
 )
 from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_unlikely
-from compensator.service.plausibility.jump_signs import AIR, NAMES, RESTED, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import AIR, LEFT, NAMES, RESTED, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import JumpState
 
 #: A jump within the permitted rate is watched for this number of samples.
@@ -46,7 +47,7 @@ class Judgement(msgspec.Struct, frozen=True):
 
 def is_watched(state: JumpState) -> bool:
     """Return whether further moves may belong to a jump within the permitted rate."""
-    return not state.is_suspect and (not state.is_unconfirmed or (state.is_air and state.samples < WATCHED_SAMPLES))
+    return not state.is_suspect and (not state.is_unconfirmed or state.is_air)
 
 
 def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
@@ -83,14 +84,20 @@ def _keep_what_is_left(
 ) -> Judgement:
     """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
     used = {name: offered[name] for name in state.shifts_k if not state.left_k.get(name)}
+    # How far it had jumped was as uncertain as what was expected then.
+    is_certain = any(abs(left) > NEAR * state.shift_std_k.get(name, 0.0) for name, left in state.left_k.items())
     state.keep_what_is_left()
     engine.restore(engines.shifted.engine.snapshot())
     engines.believe_from(engines.shifted.engine)
+    engines.believing.estimate = engines.shifted.estimate
     state.suspect()
-    then = "after most of its jump is gone, and is not used until its new value is confirmed"
-    return Judgement(
-        engines.shifted.estimate, [jump_note(name, left, then) for name, left in state.shifts_k.items()], used
-    )
+    if not is_certain:
+        state.is_suspect, state.is_unconfirmed = False, True
+        notes = [unconfirmed_note(name, left, LEFT) for name, left in state.shifts_k.items()]
+        return Judgement(engines.shifted.estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
+    then = f"{LEFT}, and is not used until its new value is confirmed"
+    notes = [jump_note(name, left, then) for name, left in state.shifts_k.items()]
+    return Judgement(engines.shifted.estimate, notes, used)
 
 
 def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
@@ -137,7 +144,7 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         state.is_unconfirmed = state.is_air = True
         return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
     # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
-    is_refuted &= is_back or not state.is_air
+    is_refuted &= (is_back and not state.is_swapped) or not state.is_air
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
@@ -164,7 +171,7 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
         engines.swap()
         state.keep_what_is_left()
-        state.is_unconfirmed = state.is_air = True
+        state.is_unconfirmed = state.is_air = state.is_swapped = True
         state.start_evidence()
         return Judgement(estimate, notes)
     return Judgement(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)

@@ -74,7 +74,7 @@ from compensator.service.plausibility.jump_evidence import (
     weigh_probe,
     weigh_y,
 )
-from compensator.service.plausibility.jump_signs import AIR, UNSEEN, JumpSigns, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
 from compensator.service.plausibility.jump_verdict import Judgement, is_watched, suspected, watched
 
@@ -203,7 +203,11 @@ class JumpWatch:
         """
         names, engines = list(self.suspects), self._engines
         if self._state.is_unconfirmed and not new_zero:
+            other = engines.shifted if engines is not None and self._state.is_swapped else None
+            if other is not None:  # it was the air: the engine that has believed it was right
+                engine.restore(other.engine.snapshot())
             self._end()
+            return [], other.estimate if other is not None else None
         if not names or engines is None:
             return [], None
         new_zero = new_zero and self._model.inputs == "changes"
@@ -245,7 +249,7 @@ class JumpWatch:
         offered = {name: _offered(channels.get(name)) for name in TEMPERATURES}
         jumped = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         notes: list[Note] = []
-        was_unconfirmed = self._state.is_unconfirmed
+        was_unconfirmed, was_new = self._state.is_unconfirmed, self._engines is None
         seen_again = self._seen_again(offered)
         if self._engines is not None and is_unsteady(self._state) and set(jumped) <= set(self._state.shifts_k):
             if jumped or moves(self._state, offered, self._change_k):
@@ -261,6 +265,11 @@ class JumpWatch:
                 self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
         elif self._engines is not None and self._signs is not None and is_watched(self._state):
             jumped = self._going_on(self._signs, self._engines, offered)
+            if self._state.is_air and "t_q_degc" in self._signs.watchable(engine, offered):
+                # One of both is wrong: what T_Q has shown of AT counts no more, nor AT of T_Q.
+                self._state.is_air = self._state.is_swapped = False
+                self._state.start_evidence()
+                jumped = ["t_q_degc", *jumped]
         if self._state.shifts_k and self._signs is not None:
             beside = [name for name in self._signs.unexpected(engine, offered, seen_again) if name not in jumped]
             jumped = [*jumped, *(name for name in beside if name not in self._state.shifts_k)]
@@ -275,8 +284,9 @@ class JumpWatch:
             self._state.start_evidence()
             notes += [jump_note(name, self._state.shifts_k[name]) for name in jumped if name in fed.jumped]
         elif fed.jumped and self._state.is_unconfirmed:
-            when = AIR if self._state.is_air else UNSEEN
-            notes += [unconfirmed_note(name, self._state.shifts_k[name], when) for name in fed.jumped]
+            for name in fed.jumped:
+                when = AIR if self._state.is_air else UNSEEN if name in seen_again or was_new else BESIDE
+                notes.append(unconfirmed_note(name, self._state.shifts_k[name], when))
         engines.weigh(self._state, offered, fed)
         engines.step(offered, fed, others)
         self._state.samples += 1
