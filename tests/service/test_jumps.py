@@ -170,7 +170,30 @@ def one_after_the_other(i: int, values: dict[str, float]) -> None:
     values["at_degc"] -= 6.0 if i > BEGIN else 0.0
 
 
-@pytest.mark.parametrize(("change", "ends"), [(both_jump, "hold"), (twice, "ok"), (one_after_the_other, "hold")])
+def again_after_a_return(i: int, values: dict[str, float]) -> None:
+    values["at_degc"] += 1.7 if BEGIN <= i < BEGIN + 20 or i >= BEGIN + 25 else 0.0
+
+
+def step_by_step(i: int, values: dict[str, float]) -> None:
+    values["at_degc"] += 1.6 * ((i >= BEGIN) + (i >= BEGIN + 40)) if i < BEGIN + 150 else 0.0
+
+
+def t_q_beside_at(i: int, values: dict[str, float]) -> None:
+    values["at_degc"] += 1.6 if BEGIN <= i < BEGIN + 200 else 0.0
+    values["t_q_degc"] += 4.5 if i >= BEGIN + 30 else 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "ends"),
+    [
+        (both_jump, "hold"),
+        (twice, "ok"),
+        (one_after_the_other, "hold"),
+        (again_after_a_return, "degraded"),
+        (step_by_step, "ok"),
+        (t_q_beside_at, "hold"),
+    ],
+)
 def test_a_jump_beside_another_one_is_never_ok_while_it_is_wrong(
     day: dict[str, np.ndarray], change: Change, ends: str
 ) -> None:
@@ -178,6 +201,17 @@ def test_a_jump_beside_another_one_is_never_ok_while_it_is_wrong(
     wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes[: BEGIN + 300]) if i > BEGIN + 1)
     assert outcomes[BEGIN + 250].offset.state == ends
+
+
+def test_resume_after_a_door_believes_what_the_air_has_done(day: dict[str, np.ndarray]) -> None:
+    """T_Q has spoken against it; once AT has returned, the engine that has not believed it was used."""
+    door = biased("at_degc", 1.7, END - 60, END)
+    outcomes = run(day, door, lambda i, c: c.resume() if i == END + 5 else None)
+    believed = offsets(run(day, door, suspect_jumps=False, jump_min_k=None))
+    assert "unconfirmed_channel:at_degc" in outcomes[END + 4].offset.reasons
+    assert abs(number(outcomes[END + 4].offset.y_offset_um) - believed[END + 4]) > 1.0
+    assert outcomes[END + 6].offset.state == "ok"
+    assert np.all(np.abs(offsets(outcomes) - believed)[END + 6 : END + 60] < 0.1)
 
 
 def test_what_is_left_of_a_jump_that_was_within_the_permitted_rate_is_not_believed(day: dict[str, np.ndarray]) -> None:
