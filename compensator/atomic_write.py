@@ -91,7 +91,7 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
     OSError
         If it cannot be written, or is a device, a pipe or a folder; what is there is kept.
     """
-    if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
+    if path.exists() and not (path.is_symlink() or path.is_file()):
         raise OSError(errno.EINVAL, "not a regular file", str(path))
     with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
         file.write(data)

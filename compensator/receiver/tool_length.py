@@ -62,7 +62,7 @@ class ToolLength:
         bool
             Whether it is now the newest length.
         """
-        is_valid = self._time_utc_ns is not None and now_s <= self._until_s
+        is_valid = now_s <= self._until_s
         if asked and is_valid:
             return False
         try:

@@ -139,11 +139,8 @@ class HeadKeeper:
 
 def _kept(before: list[End], end: End) -> tuple[End, ...]:
     """Return the ends that are kept: files that never came to disk, as on a full one, go first."""
-    for one in [*(one for one in before if not one.synced), *before]:
-        if len(before) < KEPT:
-            break
-        if one in before:
-            before.remove(one)
+    while len(before) >= KEPT:
+        before.remove(next((one for one in before if not one.synced), before[0]))
     return (*before, end)
 
 

@@ -93,8 +93,8 @@ class Regression(BankEffect, Effect):
             _check_count("std_factor", row, gains, gains, "numbers in a row, one a gain")
         self._check_channels()
         _check_each("taus_min", self.taus_min, lambda tau: 0.0 <= tau <= 1e5, "from 0 to 100000")
-        is_limit = lambda most: 0.0 <= most <= LARGEST or most == math.inf  # noqa: E731
-        _check_each("most_um", (self.most_um,), is_limit, "a number from 0 on")
+        if self.most_um != math.inf:
+            _check_each("most_um", (self.most_um,), lambda most: 0.0 <= most <= LARGEST, "a number from 0 on")
         for name, rows_of in (("gains", self.gains), ("std_factor", self.std_factor)):
             for row in rows_of:
                 _check_each(name, row, lambda value: -LARGEST < value < LARGEST, "finite")

@@ -271,8 +271,8 @@ class JumpWatch:
                 self._state.start_evidence()
                 jumped = ["t_q_degc", *jumped]
         if self._state.shifts_k and self._signs is not None:
-            beside = [name for name in self._signs.unexpected(engine, offered, seen_again) if name not in jumped]
-            jumped = [*jumped, *(name for name in beside if name not in self._state.shifts_k)]
+            known = {*jumped, *self._state.shifts_k}
+            jumped = [*jumped, *(n for n in self._signs.unexpected(engine, offered, seen_again) if n not in known)]
         engines = self._engines
         if engines is None:
             return Judgement()
