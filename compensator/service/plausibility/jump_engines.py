@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 from compensator.arrays import NAN
 from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
-from compensator.service.plausibility.jump_state import Branch, JumpState
+from compensator.service.plausibility.jump_state import Branch, JumpState, Phase
 
 #: A value counts as expected within this number of standard deviations.
 NEAR = 4.0
@@ -55,6 +56,19 @@ class Fed:
 
     values: dict[str, float]
     jumped: list[str]
+
+
+class _Move(Enum):
+    """What a channel does in a sample, as the shifted engine sees it."""
+
+    #: It is where it is expected, but for what is left of its jump.
+    BACK = "back"
+    #: It keeps its jump.
+    FOLLOWS = "follows"
+    #: It has no level: it is on its way back, or a loose contact.
+    NOWHERE = "nowhere"
+    #: It jumps, or goes on with the same jump.
+    JUMPS, GOES_ON = "jumps", "goes on"
 
 
 class JumpEngines:
@@ -153,53 +167,25 @@ class JumpEngines:
         values: dict[str, float] = {}
         new: list[str] = []
         for name in TEMPERATURES:
-            value, goes_on = offered[name], False
+            value = offered[name]
             expected, std = expected_value(self.shifted.engine, name, values.get("at_degc", NAN))
             difference = value - expected
             if math.isnan(value):
                 values[name] = NAN
-            elif name in state.shifts_k:
-                shift = state.shifts_k[name]
-                # A heat that is switched may bring it back for a moment.
-                unsure = min(state.back.get(name, 0), BACK_SAMPLES)
-                if state.is_air:  # AT on its way back widens what is expected, not where it was
-                    is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
-                else:
-                    is_back = _has_returned(difference, std, shift, state.first_k[name])
-                state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
-                if state.back[name] <= 1:
-                    is_part = is_back and abs(difference) > max(0.0 if state.is_air else NEAR * std, least_k)
-                    state.left_k[name] = difference if is_part else 0.0
-                most = max((1 + unsure) * change_k[name], NEAR * std)
-                if is_back:
-                    values[name], state.moving = value - state.left_k.get(name, 0.0), 0
-                elif name in jumped and not state.is_suspect:
-                    new.append(name)
-                elif is_unsteady(state):
-                    values[name] = NAN
-                elif state.is_air and shift and difference / shift < 1.0 - _RETURNED and state.moving < _MOST_MOVING:
-                    # A door closes: where AT comes to rest says whether it is back.
-                    values[name], state.moving = NAN, state.moving + 1
-                elif abs(difference - shift) <= most or not state.is_suspect:
-                    values[name], state.moving = value - shift, 0
-                else:
-                    new.append(name)
-                    same_way = (difference - shift) * shift > 0.0
-                    goes_on = same_way and state.samples == 1 and state.steps < _MOST_STEPS
-                    state.steps += goes_on
-                    state.again += not goes_on
-            elif name in jumped:
-                new.append(name)
+                continue
+            if name in state.shifts_k:
+                move = _move(state, name, difference, std, change_k[name], least_k, is_fast=name in jumped)
             else:
-                values[name] = value
-            if name in new:
-                state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
-                state.shift_std_k[name] = std
-                state.is_swapped = False
-                # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect
-                # channel that had come to rest has jumped again.
-                first_k = state.first_k.get(name, difference)
-                state.first_k[name] = first_k if state.is_suspect and not goes_on else difference
+                move = _Move.JUMPS if name in jumped else _Move.BACK
+            if move == _Move.BACK:
+                values[name] = value - state.left_k.get(name, 0.0)
+            elif move == _Move.FOLLOWS:
+                values[name] = value - state.shifts_k[name]
+            else:
+                values[name] = NAN
+            if move in {_Move.JUMPS, _Move.GOES_ON}:
+                new.append(name)
+                _enter_jump(state, name, difference, std, goes_on=move == _Move.GOES_ON)
         return Fed(values, new)
 
     def goes_away(self, state: JumpState, offered: Mapping[str, float]) -> bool:
@@ -278,6 +264,53 @@ class JumpEngines:
         if believing < _FITS and shifted > believing + _CONTRADICTS:
             return 1
         return -1 if shifted < max(_FITS, _FITS_PART * believing) and believing > shifted + _CONTRADICTS else 0
+
+
+def _move(
+    state: JumpState, name: str, difference: float, std: float, change_k: float, least_k: float, *, is_fast: bool
+) -> _Move:
+    """Find what a channel that has jumped does now; its counts are kept in the state."""
+    shift = state.shifts_k[name]
+    # A heat that is switched may bring it back for a moment.
+    unsure = min(state.back.get(name, 0), BACK_SAMPLES)
+    if state.is_air:  # AT on its way back widens what is expected, not where it was
+        is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
+    else:
+        is_back = _has_returned(difference, std, shift, state.first_k[name])
+    state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
+    if state.back[name] <= 1:
+        is_part = is_back and abs(difference) > max(0.0 if state.is_air else NEAR * std, least_k)
+        state.left_k[name] = difference if is_part else 0.0
+    if is_back:
+        state.moving = 0
+        return _Move.BACK
+    if is_fast and not state.is_suspect:
+        return _Move.JUMPS
+    if is_unsteady(state):
+        return _Move.NOWHERE
+    if state.is_air and shift and difference / shift < 1.0 - _RETURNED and state.moving < _MOST_MOVING:
+        # A door closes: where AT comes to rest says whether it is back.
+        state.moving += 1
+        return _Move.NOWHERE
+    if not state.is_suspect or abs(difference - shift) <= max((1 + unsure) * change_k, NEAR * std):
+        state.moving = 0
+        return _Move.FOLLOWS
+    is_same_way = (difference - shift) * shift > 0.0
+    return _Move.GOES_ON if is_same_way and state.samples == 1 and state.steps < _MOST_STEPS else _Move.JUMPS
+
+
+def _enter_jump(state: JumpState, name: str, difference: float, std: float, *, goes_on: bool) -> None:
+    """Enter a jump, or the next step of one, in the state."""
+    is_again = state.is_suspect and name in state.shifts_k
+    state.steps += is_again and goes_on
+    state.again += is_again and not goes_on
+    state.shifts_k[name], state.shift_std_k[name], state.back[name] = difference, std, 0
+    if state.phase == Phase.AIR_RETURNED:
+        state.phase = Phase.AIR
+    # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect channel that had
+    # come to rest has jumped again.
+    first_k = state.first_k.get(name, difference)
+    state.first_k[name] = first_k if state.is_suspect and not goes_on else difference
 
 
 def is_unsteady(state: JumpState) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
+
 import msgspec
 
 from compensator.arrays import NAN
@@ -9,6 +11,25 @@ from compensator.model.engine import EngineState, Estimate
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
+
+
+class Phase(StrEnum):
+    """What is known of the channels that have jumped."""
+
+    #: No channel has.
+    NONE = "none"
+    #: They are used and watched: a jump within the permitted rate, or heat, or air.
+    WATCHED = "watched"
+    #: They are not used.
+    SUSPECT = "suspect"
+    #: They are not used; until they jumped again they were, and the compensation's engine knows what they showed.
+    SUSPECT_AFTER_USE = "suspect_after_use"
+    #: They are used, and read otherwise than expected, after samples without them or beside another jump.
+    UNCONFIRMED = "unconfirmed"
+    #: AT alone, used: it has moved within its permitted rate, and T_Q has not followed.
+    AIR = "air"
+    #: The same AT has returned; the shifted engine is the one that has believed it meanwhile.
+    AIR_RETURNED = "air_returned"
 
 
 class Branch(msgspec.Struct, kw_only=True, frozen=True):
@@ -37,8 +58,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Jumps after the first one, also of earlier times until `FORGOTTEN_SAMPLES` have passed.
     quiet : int
         Samples since the last jump or return.
-    is_suspect : bool
-        Whether these channels are not used; otherwise they are watched.
+    phase : Phase
+        What is known of these channels.
     samples : int
         Samples since the last jump.
     ratio : float
@@ -48,21 +69,13 @@ class JumpState(msgspec.Struct, kw_only=True):
     left_k : dict of str to float
         By channel that is back: what is left of its jump, K; 0 where that is too little to be one.
     moving : int
-        Consecutive samples for which AT of `is_air` has been on its way back.
+        Consecutive samples for which AT of `Phase.AIR` has been on its way back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
     last : dict of str to float
         Values of the last sample with a jump under way, °C.
     unseen : dict of str to int
         By channel: samples since its last value.
-    is_unconfirmed : bool
-        Whether these channels read otherwise than expected, after samples without them or as `is_air`; they are used.
-    is_air : bool
-        Whether AT alone has moved within its permitted rate, and T_Q has not followed.
-    is_swapped : bool
-        Whether AT of `is_air` has returned, and the shifted engine is the one that has believed it meanwhile.
-    was_used : bool
-        Whether they were used like that until they jumped again: the compensation's engine knows what they showed.
     age, loose : int
         Samples since the first jump, or since what they showed was kept; how many of them had passed at the last jump.
     y_for, y_against : int
@@ -80,11 +93,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     steps: int = 0
     again: int = 0
     quiet: int = FORGOTTEN_SAMPLES
-    is_suspect: bool = False
-    is_unconfirmed: bool = False
-    is_air: bool = False
-    is_swapped: bool = False
-    was_used: bool = False
+    phase: Phase = Phase.NONE
     age: int = 0
     loose: int = 0
     last: dict[str, float] = {}
@@ -102,6 +111,26 @@ class JumpState(msgspec.Struct, kw_only=True):
     believing: Branch | None = None
     shifted: Branch | None = None
 
+    @property
+    def is_suspect(self) -> bool:
+        """Whether these channels are not used."""
+        return self.phase in {Phase.SUSPECT, Phase.SUSPECT_AFTER_USE}
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether they are used although nothing confirms them."""
+        return self.phase == Phase.UNCONFIRMED or self.is_air
+
+    @property
+    def is_air(self) -> bool:
+        """Whether AT alone is in question, and may have shown the air."""
+        return self.phase in {Phase.AIR, Phase.AIR_RETURNED}
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether further moves may belong to a jump within the permitted rate."""
+        return self.phase == Phase.WATCHED or self.is_air
+
     def keep_what_is_left(self) -> None:
         """Go on with what is left of the jumps of the channels that are back; of AT alone even if that is nothing."""
         left_k = {name: left for name, left in self.left_k.items() if left}
@@ -118,20 +147,18 @@ class JumpState(msgspec.Struct, kw_only=True):
         self.samples, self.ratio = 0, 0.0
         self.y_for = self.y_against = self.probes_for = self.probes_against = 0
 
-    def suspect(self, *, was_used: bool = False) -> None:
+    def suspect(self, phase: Phase = Phase.SUSPECT) -> None:
         """Use the channels no longer that were watched or unconfirmed."""
-        self.is_suspect, self.is_unconfirmed, self.was_used = True, False, was_used
-        self.is_air = self.is_swapped = False
+        self.phase = phase
         self.start_evidence()
 
-    def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:
+    def begun(self, phase: Phase) -> JumpState:
         """Return the state when a channel has jumped, or may have while it was not seen."""
-        again = self.again + is_suspect if self.quiet < FORGOTTEN_SAMPLES else 0
+        again = self.again + (phase == Phase.SUSPECT) if self.quiet < FORGOTTEN_SAMPLES else 0
         return JumpState(
             level_um=self.level_um,
             quiet=self.quiet,
-            is_suspect=is_suspect,
-            is_unconfirmed=is_unconfirmed,
+            phase=phase,
             unseen=self.unseen,
             again=again,
         )

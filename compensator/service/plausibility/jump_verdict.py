@@ -18,7 +18,7 @@ from compensator.service.plausibility.jump_engines import (
 )
 from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_unlikely
 from compensator.service.plausibility.jump_signs import AIR, LEFT, NAMES, RESTED, jump_note, unconfirmed_note
-from compensator.service.plausibility.jump_state import JumpState
+from compensator.service.plausibility.jump_state import JumpState, Phase
 
 #: A jump within the permitted rate is watched for this number of samples.
 WATCHED_SAMPLES = 15
@@ -45,11 +45,6 @@ class Judgement(msgspec.Struct, frozen=True):
     ends: bool = False
 
 
-def is_watched(state: JumpState) -> bool:
-    """Return whether further moves may belong to a jump within the permitted rate."""
-    return not state.is_suspect and (not state.is_unconfirmed or state.is_air)
-
-
 def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
     """Decide whether channels that are not used are used again, and from which engine on.
 
@@ -69,7 +64,7 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
         if any(state.left_k.values()):
             return (_settle if is_unsteady(state) else _keep_what_is_left)(engine, engines, state, offered)
         return _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
-    if state.at_held >= needed and not state.was_used:
+    if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
         return _accept(engine, state, offered, None, "has returned to where it was before")
     by = confirmed_by(state)
     if by:
@@ -92,7 +87,7 @@ def _keep_what_is_left(
     engines.believing.estimate = engines.shifted.estimate
     state.suspect()
     if not is_certain:
-        state.is_suspect, state.is_unconfirmed = False, True
+        state.phase = Phase.UNCONFIRMED
         notes = [unconfirmed_note(name, left, LEFT) for name, left in state.shifts_k.items()]
         return Judgement(engines.shifted.estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
     then = f"{LEFT}, and is not used until its new value is confirmed"
@@ -108,7 +103,7 @@ def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         state.shifts_k[name] = offered[name] - expected
         notes.append(unconfirmed_note(name, state.shifts_k[name], RESTED))
     engine.restore(engines.believing.engine.snapshot())
-    state.is_suspect, state.is_unconfirmed = False, True
+    state.phase = Phase.UNCONFIRMED
     state.samples, state.ratio = 0, 0.0
     return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
 
@@ -141,10 +136,10 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     is_refuted, only_at = is_unlikely(state), list(state.shifts_k) == ["at_degc"]
     is_back = all(state.back.get(name, 0) > 0 for name in state.shifts_k)
     if only_at and is_refuted and not is_back and not state.is_unconfirmed:
-        state.is_unconfirmed = state.is_air = True
+        state.phase = Phase.AIR
         return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
     # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
-    is_refuted &= (is_back and not state.is_swapped) or not state.is_air
+    is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
@@ -171,7 +166,7 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
         engines.swap()
         state.keep_what_is_left()
-        state.is_unconfirmed = state.is_air = state.is_swapped = True
+        state.phase = Phase.AIR_RETURNED
         state.start_evidence()
         return Judgement(estimate, notes)
     return Judgement(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)

@@ -75,8 +75,8 @@ from compensator.service.plausibility.jump_evidence import (
     weigh_y,
 )
 from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
-from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
-from compensator.service.plausibility.jump_verdict import Judgement, is_watched, suspected, watched
+from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState, Phase
+from compensator.service.plausibility.jump_verdict import Judgement, suspected, watched
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
@@ -203,7 +203,7 @@ class JumpWatch:
         """
         names, engines = list(self.suspects), self._engines
         if self._state.is_unconfirmed and not new_zero:
-            other = engines.shifted if engines is not None and self._state.is_swapped else None
+            other = engines.shifted if self._state.phase == Phase.AIR_RETURNED and engines is not None else None
             if other is not None:  # it was the air: the engine that has believed it was right
                 engine.restore(other.engine.snapshot())
             self._end()
@@ -213,7 +213,7 @@ class JumpWatch:
         new_zero = new_zero and self._model.inputs == "changes"
         run = engines.shifted if new_zero else engines.believing
         estimate: Estimate | None = run.estimate
-        if new_zero and self._state.was_used:
+        if new_zero and self._state.phase == Phase.SUSPECT_AFTER_USE:
             # What the engine has gone on from stays; its estimate does, too.
             shifts, estimate = shifts_against(engine, self._state), None
         else:
@@ -257,17 +257,17 @@ class JumpWatch:
         elif self._engines is not None and jumped and not self._state.is_suspect:
             self._use_no_longer(engine, self._engines, offered)
         elif jumped and not self._state.is_suspect:
-            self._begin(engine, self._state.begun(is_suspect=True))
+            self._begin(engine, self._state.begun(Phase.SUSPECT))
         elif not self._state.shifts_k and self._signs is not None:
             hidden = self._signs.unexpected(engine, offered, seen_again)
             jumped = [*hidden, *(name for name in self._signs.watchable(engine, offered) if name not in hidden)]
             if jumped:
-                self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
-        elif self._engines is not None and self._signs is not None and is_watched(self._state):
+                self._begin(engine, self._state.begun(Phase.UNCONFIRMED if hidden else Phase.WATCHED))
+        elif self._engines is not None and self._signs is not None and self._state.is_watched:
             jumped = self._going_on(self._signs, self._engines, offered)
             if self._state.is_air and "t_q_degc" in self._signs.watchable(engine, offered):
                 # One of both is wrong: what T_Q has shown of AT counts no more, nor AT of T_Q.
-                self._state.is_air = self._state.is_swapped = False
+                self._state.phase = Phase.UNCONFIRMED
                 self._state.start_evidence()
                 jumped = ["t_q_degc", *jumped]
         if self._state.shifts_k and self._signs is not None:
@@ -337,7 +337,7 @@ class JumpWatch:
     def _answers(self) -> tuple[Estimate, Estimate] | None:
         """Return both answers as long as a channel is, or was, used that nothing confirms."""
         state, engines = self._state, self._engines
-        if engines is None or not (state.is_unconfirmed or (state.is_suspect and state.was_used)):
+        if engines is None or not (state.is_unconfirmed or state.phase == Phase.SUSPECT_AFTER_USE):
             return None
         used, other = engines.believing.estimate if state.is_unconfirmed else self._estimate, engines.shifted.estimate
         return (used, other) if used is not None and other is not None else None
@@ -350,13 +350,13 @@ class JumpWatch:
             state.age = 0
         else:
             engine.restore(engines.shifted.engine.snapshot())
-        self._state.suspect(was_used=was_used)
+        self._state.suspect(Phase.SUSPECT_AFTER_USE if was_used else Phase.SUSPECT)
         self._believe_anew(engine, engines, offered)
 
     def _believe_anew(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
         """Let the believing engine begin with this jump: what was wrong before it is undone."""
         self._state.loose = self._state.age
-        is_kept = self._state.was_used and engines.fits(engine, self._state, offered)
+        is_kept = self._state.phase == Phase.SUSPECT_AFTER_USE and engines.fits(engine, self._state, offered)
         engines.believe_from(engine if is_kept else engines.shifted.engine)
 
     def _unsettle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> list[Note]:
