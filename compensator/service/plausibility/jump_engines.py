@@ -136,10 +136,14 @@ class JumpEngines:
         engine.restore(without.snapshot())
         return estimate
 
-    def step(self, offered: Mapping[str, float], fed: Fed, others: Mapping[str, float]) -> None:
-        """Step both by a sample."""
-        for run, values in ((self.believing, offered), (self.shifted, fed.values)):
-            run.estimate = run.engine.step(values["t_q_degc"], values["at_degc"], others)
+    def step(
+        self, offered: Mapping[str, float], fed: Fed, others: Mapping[str, float], stepped: Estimate | None
+    ) -> None:
+        """Step both by a sample; `stepped` is the estimate of the shifted one if it already is."""
+        self.believing.estimate = self.believing.engine.step(offered["t_q_degc"], offered["at_degc"], others)
+        self.shifted.estimate = stepped or self.shifted.engine.step(
+            fed.values["t_q_degc"], fed.values["at_degc"], others
+        )
 
     def feed(
         self,

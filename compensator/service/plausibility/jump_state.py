@@ -84,6 +84,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Probes that have spoken for them.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
+    beside : JumpState, optional
+        State of the watch of the other channel, while one is suspect.
     """
 
     level_um: float = NAN
@@ -110,6 +112,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
+    beside: JumpState | None = None
 
     @property
     def is_suspect(self) -> bool:

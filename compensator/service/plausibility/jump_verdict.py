@@ -37,12 +37,15 @@ class Judgement(msgspec.Struct, frozen=True):
         Channels that are used again, with their values, °C.
     ends : bool
         Whether the jump is over: all channels are used as they are.
+    has_returned : bool
+        Whether that is because they are where the shifted engine expects them.
     """
 
     estimate: Estimate | None = None
     notes: list[Note] = []
     accepted: dict[str, float] = {}
     ends: bool = False
+    has_returned: bool = False
 
 
 def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
@@ -63,7 +66,8 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
     if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
         if any(state.left_k.values()):
             return (_settle if is_unsteady(state) else _keep_what_is_left)(engine, engines, state, offered)
-        return _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
+        found = _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
+        return msgspec.structs.replace(found, has_returned=True)
     if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
         return _accept(engine, state, offered, None, "has returned to where it was before")
     by = confirmed_by(state)

@@ -43,11 +43,15 @@ has shown and goes on without it. The shifted engine still believes none of it; 
 standard deviation. The channel is believed anew from the one of both that expects its new level rather: where it comes
 to rest elsewhere, one of both levels was wrong.
 
+While one channel is suspect, the other one is watched in the same way by a further watch *beside* this one, in which
+the shifted engine is that of the compensation. Once the suspect channel has returned, that watch goes on alone.
+
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -63,6 +67,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.jump_engines import (
     UNSEEN_SAMPLES,
+    Fed,
     JumpEngines,
     count_held,
     is_unsteady,
@@ -103,6 +108,8 @@ class JumpWatch:
         self._y_std_um = stated or model.y_std_um
         self._state = JumpState()
         self._engines: JumpEngines | None = None
+        self._names: tuple[str, ...] = TEMPERATURES
+        self._beside: JumpWatch | None = None
         self._estimate: Estimate | None = None
 
     def describe(self) -> str:
@@ -120,33 +127,41 @@ class JumpWatch:
         """As `doubt_um`, of each further output in its unit; empty where no channel is, or was, unconfirmed."""
         answers = self._answers()
         if answers is None:
-            return ()
+            return self._beside.doubts if self._beside is not None else ()
         pairs = zip(*(answer.outputs for answer in answers), strict=True)
         return tuple(abs(one.value - other.value) / math.sqrt(2.0) for one, other in pairs)
 
     @property
     def suspects(self) -> tuple[str, ...]:
         """Channels that are not used."""
-        return tuple(self._state.shifts_k) if self._state.is_suspect else ()
+        beside = self._beside.suspects if self._beside is not None else ()
+        return (*self._state.shifts_k, *beside) if self._state.is_suspect else ()
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
         """Channels that are used, and may have another zero since samples without them."""
-        return tuple(self._state.shifts_k) if self._state.is_unconfirmed else ()
+        beside = self._beside.unconfirmed if self._beside is not None else ()
+        return tuple(self._state.shifts_k) if self._state.is_unconfirmed else beside
 
     @property
     def doubt_um(self) -> float:
         """Standard deviation by channels that are, or were, used unconfirmed, µm: either engine may be right."""
         answers = self._answers()
-        return abs(answers[0].y_um - answers[1].y_um) / math.sqrt(2.0) if answers is not None else 0.0
+        if answers is None:
+            return self._beside.doubt_um if self._beside is not None else 0.0
+        return abs(answers[0].y_um - answers[1].y_um) / math.sqrt(2.0)
 
     @property
     def state(self) -> JumpState:
         """State after the last sample."""
         if self._engines is None:
             return msgspec.structs.replace(self._state)
-        branches = {"believing": self._engines.believing.branch(), "shifted": self._engines.shifted.branch()}
-        return msgspec.structs.replace(self._state, **branches)
+        return msgspec.structs.replace(
+            self._state,
+            believing=self._engines.believing.branch(),
+            shifted=self._engines.shifted.branch(),
+            beside=self._beside.state if self._beside is not None else None,
+        )
 
     def restore(self, state: JumpState | None) -> None:
         """Continue from a state; None if it is that of a version without this watch.
@@ -158,10 +173,15 @@ class JumpWatch:
         """
         state = state or JumpState()
         self._engines = JumpEngines.restored(self._model, state)
+        self._beside = None
+        if state.beside is not None:
+            self._beside = self._watch_beside(state)
+            self._beside.restore(state.beside)
         self._state = msgspec.structs.replace(
             state,
             believing=None,
             shifted=None,
+            beside=None,
             shifts_k=dict(state.shifts_k),
             shift_std_k=dict(state.shift_std_k),
             first_k=dict(state.first_k),
@@ -174,6 +194,8 @@ class JumpWatch:
     def reset(self, *, at_rest: bool) -> None:
         """Forget the level of measured Y and jumps that are only watched; at rest unconfirmed channels, too."""
         self._state.level_um = NAN
+        if self._beside is not None:
+            self._beside.reset(at_rest=at_rest)
         if not self._state.is_suspect and (at_rest or not self._state.is_unconfirmed):
             self._end()
 
@@ -183,6 +205,8 @@ class JumpWatch:
         self._state.start_counts()
         if self._engines is not None:
             self._engines.pass_time(samples, held=held)
+        if self._beside is not None:
+            self._beside.pass_time(samples, held=held)
 
     def release(self, engine: Engine, *, new_zero: bool) -> tuple[list[str], Estimate | None]:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
@@ -217,7 +241,9 @@ class JumpWatch:
             # What the engine has gone on from stays; its estimate does, too.
             shifts, estimate = shifts_against(engine, self._state), None
         else:
-            shifts = self._state.shifts_k
+            shifts = dict(self._state.shifts_k)
+            if self._beside is not None and self._beside.suspects:
+                shifts |= self._beside._state.shifts_k
             engine.restore(run.engine.snapshot())
         if new_zero:
             engine.shift_reference(shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0))
@@ -225,8 +251,13 @@ class JumpWatch:
         return names, estimate
 
     def _end(self) -> None:
-        self._engines = None
+        self._engines = self._beside = None
         self._state = self._state.ended()
+
+    def _go_on_with(self, beside: JumpWatch) -> None:
+        """End the jump, and go on with that of the other channel."""
+        self._state, self._engines, self._beside = beside._state, beside._engines, None
+        self._state.quiet = 0
 
     # ------------------------------------------------------------------ one sample
 
@@ -248,6 +279,17 @@ class JumpWatch:
         """
         offered = {name: _offered(channels.get(name)) for name in TEMPERATURES}
         jumped = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
+        return self._judge(engine, offered, jumped, others, y_um)
+
+    def _judge(
+        self,
+        engine: Engine,
+        offered: Mapping[str, float],
+        jumped: list[str],
+        others: Mapping[str, float],
+        y_um: float,
+    ) -> Judgement:
+        """Judge a sample of values, °C, of which some have `jumped` by their rate."""
         notes: list[Note] = []
         was_unconfirmed, was_new = self._state.is_unconfirmed, self._engines is None
         seen_again = self._seen_again(offered)
@@ -259,20 +301,20 @@ class JumpWatch:
         elif jumped and not self._state.is_suspect:
             self._begin(engine, self._state.begun(Phase.SUSPECT))
         elif not self._state.shifts_k and self._signs is not None:
-            hidden = self._signs.unexpected(engine, offered, seen_again)
-            jumped = [*hidden, *(name for name in self._signs.watchable(engine, offered) if name not in hidden)]
+            hidden = self._unexpected(engine, offered, seen_again)
+            jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
             if jumped:
                 self._begin(engine, self._state.begun(Phase.UNCONFIRMED if hidden else Phase.WATCHED))
         elif self._engines is not None and self._signs is not None and self._state.is_watched:
-            jumped = self._going_on(self._signs, self._engines, offered)
-            if self._state.is_air and "t_q_degc" in self._signs.watchable(engine, offered):
+            jumped = self._going_on(self._engines, offered)
+            if self._state.is_air and "t_q_degc" in self._watchable(engine, offered):
                 # One of both is wrong: what T_Q has shown of AT counts no more, nor AT of T_Q.
                 self._state.phase = Phase.UNCONFIRMED
                 self._state.start_evidence()
                 jumped = ["t_q_degc", *jumped]
-        if self._state.shifts_k and self._signs is not None:
+        if self._state.shifts_k:
             known = {*jumped, *self._state.shifts_k}
-            jumped = [*jumped, *(n for n in self._signs.unexpected(engine, offered, seen_again) if n not in known)]
+            jumped = [*jumped, *(n for n in self._unexpected(engine, offered, seen_again) if n not in known)]
         engines = self._engines
         if engines is None:
             return Judgement()
@@ -287,17 +329,21 @@ class JumpWatch:
             for name in fed.jumped:
                 when = AIR if self._state.is_air else UNSEEN if name in seen_again or was_new else BESIDE
                 notes.append(unconfirmed_note(name, self._state.shifts_k[name], when))
+        beside = self._watch_other(engines, fed, others, y_um)
+        notes += beside.notes
         engines.weigh(self._state, offered, fed)
-        engines.step(offered, fed, others)
+        engines.step(offered, fed, others, beside.estimate)
         self._state.samples += 1
         self._state.age += 1
         weigh_y(self._state, engines, y_um, self._y_std_um)
         is_suspect = self._state.is_suspect
         estimate = engines.go_without(engine, self._state, offered, others) if was_unconfirmed and is_suspect else None
         verdict = (suspected if is_suspect else watched)(engine, engines, self._state, offered)
-        if verdict.ends:
+        if verdict.has_returned and self._beside is not None and self._beside._state.shifts_k:
+            self._go_on_with(self._beside)
+        elif verdict.ends:
             self._end()
-        return Judgement(verdict.estimate or estimate, [*notes, *verdict.notes], verdict.accepted)
+        return Judgement(verdict.estimate or estimate, [*notes, *verdict.notes], beside.accepted | verdict.accepted)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
         """Compare both engines with a probe.
@@ -314,6 +360,8 @@ class JumpWatch:
         if self._engines is not None:
             std_um = math.hypot(std_um, self._y_std_um)
             weigh_probe(self._state, self._engines, innovation_um + predicted_um, std_um)
+        if self._beside is not None:
+            self._beside.receive_probe(innovation_um, std_um, predicted_um)
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
@@ -375,11 +423,39 @@ class JumpWatch:
         self._use_no_longer(engine, engines, offered)
         return [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if not math.isnan(offered[name])]
 
-    def _going_on(self, signs: JumpSigns, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
+    def _watch_beside(self, state: JumpState) -> JumpWatch:
+        """Return a watch for the channels that have not jumped."""
+        watch = copy.copy(self)
+        watch._names = tuple(name for name in self._names if name not in state.shifts_k)
+        watch._state, watch._engines, watch._beside = JumpState(level_um=state.level_um), None, None
+        return watch
+
+    def _watch_other(self, engines: JumpEngines, fed: Fed, others: Mapping[str, float], y_um: float) -> Judgement:
+        """Watch the other channel while one is suspect; the shifted engine is that of the compensation then."""
+        if not self._state.is_suspect or len(self._state.shifts_k) != 1 or self._signs is None:
+            self._beside = None
+            return Judgement()
+        if self._beside is None:
+            self._beside = self._watch_beside(self._state)
+        found = self._beside._judge(engines.shifted.engine, fed.values, [], others, y_um)
+        fed.values.update(dict.fromkeys(self._beside.suspects, NAN))
+        return found
+
+    def _unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
+        if self._signs is None:
+            return []
+        return [name for name in self._signs.unexpected(engine, offered, seen_again) if name in self._names]
+
+    def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
+        if self._signs is None:
+            return []
+        return [name for name in self._signs.watchable(engine, offered) if name in self._names]
+
+    def _going_on(self, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
         """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
         shifts = self._state.shifts_k
         less = {name: value - shifts.get(name, 0.0) for name, value in offered.items()}
-        return [name for name in signs.watchable(engines.shifted.engine, less) if name in shifts]
+        return [name for name in self._watchable(engines.shifted.engine, less) if name in shifts]
 
     def _seen_again(self, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that are seen again after samples without them, and count such samples."""
