@@ -19,6 +19,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from sim_hardware.physics.duty import GRID_S
 from tests.audit.test_signatures import write_key
 from tests.service.records import QUILL, direct, sample
 from tests.service.simulated import TABLE, config
@@ -183,9 +184,27 @@ def t_q_beside_at(i: int, values: dict[str, float]) -> None:
     values["t_q_degc"] += 4.5 if i >= BEGIN + 30 else 0.0
 
 
+def at_steps_while_t_q_is_suspect(i: int, values: dict[str, float]) -> None:
+    values["t_q_degc"] += 8.0 if BEGIN <= i < BEGIN + 90 else 0.0
+    values["at_degc"] += 1.6 if BEGIN + 30 <= i < BEGIN + 160 else 0.0
+
+
+def at_goes_on_to_be_wrong(i: int, values: dict[str, float]) -> None:
+    values["t_q_degc"] += 8.0 if BEGIN <= i < BEGIN + 90 else 0.0
+    values["at_degc"] -= 1.6 if i >= BEGIN + 30 else 0.0
+
+
+def t_q_steps_while_at_is_suspect(i: int, values: dict[str, float]) -> None:
+    values["at_degc"] += 5.0 if BEGIN <= i < BEGIN + 90 else 0.0
+    values["t_q_degc"] -= 4.0 if BEGIN + 30 <= i < BEGIN + 160 else 0.0
+
+
 @pytest.mark.parametrize(
     ("change", "ends"),
     [
+        (at_steps_while_t_q_is_suspect, "ok"),
+        (at_goes_on_to_be_wrong, "degraded"),
+        (t_q_steps_while_at_is_suspect, "ok"),
         (both_jump, "hold"),
         (twice, "ok"),
         (one_after_the_other, "hold"),
@@ -201,6 +220,41 @@ def test_a_jump_beside_another_one_is_never_ok_while_it_is_wrong(
     wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes[: BEGIN + 300]) if i > BEGIN + 1)
     assert outcomes[BEGIN + 250].offset.state == ends
+
+
+def test_a_door_while_t_q_is_suspect_neither_holds_the_offset_nor_keeps_t_q_from_its_return() -> None:
+    """T_Q follows the air in this model, also with another zero."""
+    duty = Duty.working_day(5, hours=14.0)
+    minutes = np.arange(len(duty.columns["ambient_degc"])) * GRID_S / 60.0
+    is_open = (minutes >= BEGIN + 30) & (minutes < BEGIN + 70)
+    air = duty.columns["ambient_degc"] - 1.8 * is_open
+    duty = Duty(duty.duration_s, **(duty.columns | {"ambient_degc": air}))
+    day = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 5).record(60.0)
+    outcomes = run(day, biased("t_q_degc", 8.0, BEGIN, BEGIN + 50))
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    assert not any("suspect_channel:at_degc" in o.offset.reasons for o in outcomes)
+    assert events(outcomes, "accepted")[0] == BEGIN + 52
+    assert np.max(apart[BEGIN + 62 :]) < 1.0
+    assert {o.offset.state for o in outcomes[BEGIN + 120 :]} == {"ok"}
+
+
+def test_a_new_zero_counts_for_both_channels_that_are_suspect(day: dict[str, np.ndarray]) -> None:
+    """AT jumps by its rate, and T_Q beside it within its own: both have another zero from the zero on."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] -= 5.0 if i >= BEGIN else 0.0
+        values["t_q_degc"] += 4.0 if i >= BEGIN + 30 else 0.0
+
+    def zero(i: int, compensation: Compensation) -> None:
+        if i == END:
+            assert {f"suspect_channel:{name}" for name in ("t_q_degc", "at_degc")} <= reasons
+            compensation.zero("warm")
+
+    reasons = {r for o in run(day, change)[END - 1 : END] for r in o.offset.reasons}
+    outcomes = run(day, change, zero)
+    healthy = offsets(run(day, act=lambda i, c: c.zero("warm") if i == END else None))
+    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 30 : END + 120]) < 1.0
+    assert {o.offset.state for o in outcomes[END + 30 : END + 120]} == {"ok"}
 
 
 def test_resume_after_a_door_believes_what_the_air_has_done(day: dict[str, np.ndarray]) -> None:
@@ -630,10 +684,13 @@ def test_a_direct_model_keeps_a_suspect_until_an_operator_decides(day: dict[str,
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN:END])
 
 
+@pytest.mark.parametrize("is_beside", [False, True])
 @pytest.mark.parametrize(
     ("channel", "size", "left"), [("t_q_degc", -3.5, 0.0), ("at_degc", 1.6, 0.0), ("at_degc", 8.0, 1.4)]
 )
-def test_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray], channel: str, size: float, left: float) -> None:
+def test_the_state_goes_on_to_the_bit(
+    day: dict[str, np.ndarray], channel: str, size: float, left: float, is_beside: bool
+) -> None:
     conf = settings()
     whole = Compensation(conf, QUILL)
 
@@ -643,6 +700,8 @@ def test_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray], channel: str, 
     for i in range(200, 360):
         values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
         change(i, values)
+        if is_beside:
+            values["at_degc" if channel == "t_q_degc" else "t_q_degc"] -= 1.6 if 270 <= i < 345 else 0.0
         if 300 < i < 304:
             values["at_degc"] = math.nan
         restored = Compensation(conf, QUILL)

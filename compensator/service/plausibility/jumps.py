@@ -235,16 +235,19 @@ class JumpWatch:
         if not names or engines is None:
             return [], None
         new_zero = new_zero and self._model.inputs == "changes"
-        run = engines.shifted if new_zero else engines.believing
+        # Where both are suspect, the watch beside this one takes both less their jumps.
+        beside = self._beside if self._beside is not None and self._beside.suspects else None
+        shifted = beside._engines.shifted if beside is not None and beside._engines is not None else engines.shifted
+        run = shifted if new_zero else engines.believing
         estimate: Estimate | None = run.estimate
         if new_zero and self._state.phase == Phase.SUSPECT_AFTER_USE:
             # What the engine has gone on from stays; its estimate does, too.
             shifts, estimate = shifts_against(engine, self._state), None
         else:
             shifts = dict(self._state.shifts_k)
-            if self._beside is not None and self._beside.suspects:
-                shifts |= self._beside._state.shifts_k
             engine.restore(run.engine.snapshot())
+        if beside is not None:
+            shifts |= beside._state.shifts_k
         if new_zero:
             engine.shift_reference(shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0))
         self._end()
