@@ -185,6 +185,11 @@ class FurtherOutputs:
             if estimate is None:
                 state.rates = []
 
+    def move_zero(self, before: Estimate, now: Estimate) -> None:
+        """Account for another estimate of what was predicted at the zero: its state was wrong then."""
+        for one, old, new in zip(self.planned, before.outputs, now.outputs, strict=True):
+            self.states[one.name].base += new.value - old.value
+
     def predictions(self, estimate: Estimate | None) -> list[OutputPrediction]:
         """Return the outputs since the zero."""
         if estimate is None or not self.planned:

@@ -29,6 +29,7 @@ from compensator.service.decision import Decision, mean
 from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
     HEATED_W,
+    Judgement,
     SensorEvidence,
 )
 from compensator.service.probing import ReceivedProbe, Wanted
@@ -80,11 +81,10 @@ class Compensation(Continuity):
 
     def _release(self, *, new_zero: bool) -> None:
         """Use channels again that have jumped."""
-        names, estimate = self._jumps.release(self._engine, new_zero=new_zero)
-        for name in names:
-            self._guards.accept(name, NAN)
-        if estimate is not None:
-            self._memory.estimate = estimate
+        found = self._jumps.release(self._engine, new_zero=new_zero)
+        self._follow(found)
+        if found.estimate is not None:
+            self._memory.estimate = found.estimate
 
     def receive_probes(self, probes: Sequence[ReceivedProbe]) -> None:
         """Receive the probes that the next sample decides; without `[probe]` they are ignored."""
@@ -191,9 +191,17 @@ class Compensation(Continuity):
             return None
         found = self._jumps.update(self._engine, sample.channels, values.others, values.y)
         notes += found.notes
+        self._follow(found)
+        return found.estimate
+
+    def _follow(self, found: Judgement) -> None:
+        """Accept channels that are used again; the zero goes with the state that the engine was given."""
         for name, value in found.accepted.items():
             self._guards.accept(name, value)
-        return found.estimate
+        if found.zeros is not None:
+            before, now = found.zeros
+            self._zero.y_base += now.y_um - before.y_um
+            self.outputs.move_zero(before, now)
 
     def _remember_sample(self, time_ns: int, estimate: Estimate) -> None:
         """Keep what a probe of this time is compared with."""

@@ -523,6 +523,29 @@ def test_a_jump_of_a_temperature_is_judged_for_every_axis() -> None:
     assert by_axis(one)["z"].y_offset_um != plain["z"].y_offset_um
 
 
+def test_a_warm_zero_while_at_is_unconfirmed_counts_for_every_axis_whichever_answer_was_right() -> None:
+    guards = {
+        "guards.t_q_below_at_max_k = 2.0": "guards = {t_q_below_at_max_k = 2.0, suspect_jumps = true, jump_min_k = 0.6}"
+    }
+
+    def offsets(size_k: float) -> list[dict[str, float | None]]:
+        running, found = compensation(**guards), []
+        for i, values in enumerate(made.readings(300)):
+            values["at_degc"] += size_k if 100 <= i < 180 else 0.0
+            if i == 140:
+                running.zero("warm")
+            outcome = running.process(sample(i, values | {"x_um": 1.0, "z_um": 2.0}))
+            found.append({axis: one.y_offset_um for axis, one in by_axis(outcome).items()})
+            if 110 <= i < 180:
+                assert ("unconfirmed_channel:at_degc" in outcome.offset.reasons) is (size_k != 0.0)
+        return found
+
+    wrong, right = offsets(0.9), offsets(0.0)
+    assert abs(wrong[135]["y"] - right[135]["y"]) > 5.0
+    for axis in "yxza":
+        assert wrong[-1][axis] == pytest.approx(right[-1][axis], abs=0.5), axis
+
+
 def test_axes_that_are_added_begin_at_zero_and_y_goes_on(tmp_path: Path) -> None:
     machine = SeveralAxes(tmp_path, made.CONFIG + SENSORS.encode(), model_text("y"))
     machine.run(150)

@@ -257,6 +257,38 @@ def test_a_new_zero_counts_for_both_channels_that_are_suspect(day: dict[str, np.
     assert {o.offset.state for o in outcomes[END + 30 : END + 120]} == {"ok"}
 
 
+@pytest.mark.parametrize(
+    ("channel", "size", "unseen"),
+    [("at_degc", 1.6, 0), ("at_degc", -2.4, 5), ("t_q_degc", 6.0, 8)],
+)
+def test_a_zero_on_a_warm_machine_is_right_whichever_answer_of_an_unconfirmed_channel_was(
+    day: dict[str, np.ndarray], channel: str, size: float, unseen: int
+) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        values[channel] += size if BEGIN <= i < END else 0.0
+        if BEGIN - unseen <= i < BEGIN:
+            values[channel] = math.nan
+
+    def zero(i: int, compensation: Compensation) -> None:
+        if i == BEGIN + 60:
+            compensation.zero("warm")
+
+    outcomes, healthy = run(day, change, zero), offsets(run(day, act=zero))
+    stds = np.array([number(o.offset.y_offset_std_um) for o in outcomes])
+    assert f"unconfirmed_channel:{channel}" in outcomes[BEGIN + 60].offset.reasons
+    # What both answers differ by is counted from the zero.
+    apart = np.abs(offsets(outcomes) - healthy)
+    assert stds[BEGIN + 59] > 10.0 and stds[BEGIN + 60] < 2.5
+    assert np.all(apart[BEGIN + 66 : END] < 2.0 * stds[BEGIN + 66 : END])
+    assert np.max(apart[BEGIN:END]) > 5.0 and np.max(apart[END + 12 : END + 200]) < 1.0
+
+
+def test_a_jump_that_is_only_watched_is_so_after_a_zero_on_a_warm_machine(day: dict[str, np.ndarray]) -> None:
+    outcomes = run(day, biased("t_q_degc", 4.0), lambda i, c: c.zero("warm") if i == BEGIN + 1 else None)
+    assert events(outcomes, "jumped") == [BEGIN + 1]
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 2 : END])
+
+
 def test_resume_after_a_door_believes_what_the_air_has_done(day: dict[str, np.ndarray]) -> None:
     """T_Q has spoken against it; once AT has returned, the engine that has not believed it was used."""
     door = biased("at_degc", 1.7, END - 60, END)
@@ -709,6 +741,9 @@ def test_the_state_goes_on_to_the_bit(
         if i == 310:
             for one in (whole, restored):
                 one.pause(20)
+        if i == 298:
+            for one in (whole, restored):
+                one.zero("warm")
         outcome, again = whole.process(sample(i, values)), restored.process(sample(i, values))
         assert encode(again.offset) == encode(outcome.offset) and again.notes == outcome.notes
         assert restored.state() == whole.state()

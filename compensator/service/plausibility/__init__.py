@@ -3,11 +3,13 @@
 from compensator.service.plausibility.checks import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.plausibility.guards import HEATED_W, SensorGuards
 from compensator.service.plausibility.jump_state import JumpState
+from compensator.service.plausibility.jump_verdict import Judgement
 from compensator.service.plausibility.jumps import JumpWatch
 
 __all__ = [
     "BLOCK_SAMPLES",
     "HEATED_W",
+    "Judgement",
     "JumpState",
     "JumpWatch",
     "PlausibilityCheck",

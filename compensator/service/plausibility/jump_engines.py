@@ -40,14 +40,20 @@ _FITS, _CONTRADICTS, _FITS_PART = 3.0, 4.0, 0.1
 
 @dataclass(slots=True)
 class Run:
-    """An engine and its last estimate."""
+    """An engine, its last estimate, and that of a zero on a warm machine if one was set since it runs."""
 
     engine: Engine
     estimate: Estimate | None = None
+    at_zero: Estimate | None = None
 
     def branch(self) -> Branch:
         """Return its state."""
-        return Branch(engine=self.engine.snapshot(), estimate=self.estimate)
+        return Branch(engine=self.engine.snapshot(), estimate=self.estimate, at_zero=self.at_zero)
+
+    @property
+    def grown_um(self) -> float:
+        """Predicted deformation since that zero, µm; NaN without an estimate."""
+        return grown(self.estimate, self.at_zero)[0] if self.estimate is not None else NAN
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +84,12 @@ class JumpEngines:
     ----------
     believing, shifted : Run
         The engines.
+    used_zero : Estimate, optional
+        What the compensation's engine had estimated at a zero on a warm machine, if one was set since they run.
     """
 
-    def __init__(self, believing: Run, shifted: Run) -> None:
-        self.believing, self.shifted = believing, shifted
+    def __init__(self, believing: Run, shifted: Run, used_zero: Estimate | None = None) -> None:
+        self.believing, self.shifted, self.used_zero = believing, shifted, used_zero
 
     @classmethod
     def begin(cls, model: ThermalModel, state: EngineState) -> JumpEngines:
@@ -104,16 +112,28 @@ class JumpEngines:
         are_both = believing is not None and shifted is not None
         if are_both != bool(state.shifts_k) or not set(state.shifts_k) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
-        return cls(believing, shifted) if believing is not None and shifted is not None else None
+        return cls(believing, shifted, state.used_zero) if believing is not None and shifted is not None else None
+
+    def set_zero(self) -> None:
+        """Count what each of them predicts from the last sample on: a zero is not of one of two answers."""
+        self.believing.at_zero, self.shifted.at_zero = self.believing.estimate, self.shifted.estimate
+        self.used_zero = self.believing.at_zero
+
+    def give(self, engine: Engine, run: Run) -> Estimate | None:
+        """Give the compensation's engine the state of one of them, with its zero, and return its estimate."""
+        engine.restore(run.engine.snapshot())
+        self.used_zero = run.at_zero
+        return run.estimate
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured."""
         for run in (self.believing, self.shifted):
             run.estimate = run.engine.skip(samples, held=held)
 
-    def believe_from(self, engine: Engine) -> None:
-        """Give the believing engine the state of another one: the channel has jumped again."""
-        self.believing.engine.restore(engine.snapshot())
+    def believe_from(self, engine: Engine | None = None) -> None:
+        """Let the believing engine go on from the compensation's, or from the shifted one: the channel jumps again."""
+        self.believing.engine.restore((engine or self.shifted.engine).snapshot())
+        self.believing.at_zero = self.used_zero if engine is not None else self.shifted.at_zero
 
     def go_without(
         self, engine: Engine, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
@@ -245,8 +265,8 @@ class JumpEngines:
 
     def agree(self) -> bool:
         """Return whether both predict the same, within the standard deviation of one."""
-        one, other = self.believing.estimate, self.shifted.estimate
-        return one is not None and other is not None and abs(one.y_um - other.y_um) <= one.y_std_um
+        one = self.believing.estimate
+        return one is not None and abs(self.believing.grown_um - self.shifted.grown_um) <= one.y_std_um
 
     def speaks(self, y_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
@@ -254,17 +274,15 @@ class JumpEngines:
         Parameters
         ----------
         y_um, std_um : float
-            Y on the scale of the prediction, and its standard deviation, µm.
+            Y on the scale of the compensation's prediction, and its standard deviation, µm.
 
         Returns
         -------
         int
             1 for the believing engine, -1 for the shifted one, 0 for neither.
         """
-        if self.believing.estimate is None or self.shifted.estimate is None:
-            return 0
-        believing = abs(y_um - self.believing.estimate.y_um) / std_um
-        shifted = abs(y_um - self.shifted.estimate.y_um) / std_um
+        y_um -= self.used_zero.y_um if self.used_zero is not None else 0.0
+        believing, shifted = (abs(y_um - run.grown_um) / std_um for run in (self.believing, self.shifted))
         if believing < _FITS and shifted > believing + _CONTRADICTS:
             return 1
         return -1 if shifted < max(_FITS, _FITS_PART * believing) and believing > shifted + _CONTRADICTS else 0
@@ -369,6 +387,18 @@ def shifts_against(engine: Engine, state: JumpState) -> dict[str, float]:
     return {name: state.last[name] - expected_value(engine, name, at_degc)[0] for name in state.shifts_k}
 
 
+def grown(estimate: Estimate, at_zero: Estimate | None) -> list[float]:
+    """Return Y, µm, and the further outputs in their units, since a zero on a warm machine if one was set."""
+    values = _values(estimate)
+    if at_zero is None:
+        return values
+    return [value - zero for value, zero in zip(values, _values(at_zero), strict=True)]
+
+
+def _values(estimate: Estimate) -> list[float]:
+    return [estimate.y_um, *(output.value for output in estimate.outputs)]
+
+
 def _has_returned(difference: float, std: float, shift: float, first: float) -> bool:
     near = max(NEAR * std, _RETURNED * abs(shift))
     # Where the expectation itself is uncertain by the size of the jump, a return shows nothing.
@@ -385,5 +415,5 @@ def _run_of(model: ThermalModel, branch: Branch | None) -> Run | None:
     run = _new_run(model)
     run.engine.check(branch.engine)
     run.engine.restore(branch.engine)
-    run.estimate = branch.estimate
+    run.estimate, run.at_zero = branch.estimate, branch.at_zero
     return run

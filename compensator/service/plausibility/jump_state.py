@@ -33,10 +33,11 @@ class Phase(StrEnum):
 
 
 class Branch(msgspec.Struct, kw_only=True, frozen=True):
-    """State of one of the two engines, and its last estimate (None before the first sample)."""
+    """State of one of the two engines, its last estimate, and that of a zero on a warm machine (None before them)."""
 
     engine: EngineState
     estimate: Estimate | None = None
+    at_zero: Estimate | None = None
 
 
 class JumpState(msgspec.Struct, kw_only=True):
@@ -84,6 +85,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Probes that have spoken for them.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
+    used_zero : Estimate, optional
+        What the compensation's engine had estimated at a zero on a warm machine since then.
     beside : JumpState, optional
         State of the watch of the other channel, while one is suspect.
     """
@@ -112,6 +115,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
+    used_zero: Estimate | None = None
     beside: JumpState | None = None
 
     @property

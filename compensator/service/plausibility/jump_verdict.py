@@ -39,6 +39,9 @@ class Judgement(msgspec.Struct, frozen=True):
         Whether the jump is over: all channels are used as they are.
     has_returned : bool
         Whether that is because they are where the shifted engine expects them.
+    zeros : tuple of Estimate, optional
+        What the engine had estimated at the last zero, before and since it was given another state; None if that is
+        the same.
     """
 
     estimate: Estimate | None = None
@@ -46,6 +49,7 @@ class Judgement(msgspec.Struct, frozen=True):
     accepted: dict[str, float] = {}
     ends: bool = False
     has_returned: bool = False
+    zeros: tuple[Estimate, Estimate] | None = None
 
 
 def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
@@ -66,13 +70,13 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
     if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
         if any(state.left_k.values()):
             return (_settle if is_unsteady(state) else _keep_what_is_left)(engine, engines, state, offered)
-        found = _accept(engine, state, offered, engines.shifted, "has returned to what was expected before")
+        found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
         return msgspec.structs.replace(found, has_returned=True)
     if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
-        return _accept(engine, state, offered, None, "has returned to where it was before")
+        return _accept(engine, engines, state, offered, None, "has returned to where it was before")
     by = confirmed_by(state)
     if by:
-        return _accept(engine, state, offered, engines.believing, f"is used again: {by} with it")
+        return _accept(engine, engines, state, offered, engines.believing, f"is used again: {by} with it")
     if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
         return _settle(engine, engines, state, offered)
     return Judgement()
@@ -86,17 +90,16 @@ def _keep_what_is_left(
     # How far it had jumped was as uncertain as what was expected then.
     is_certain = any(abs(left) > NEAR * state.shift_std_k.get(name, 0.0) for name, left in state.left_k.items())
     state.keep_what_is_left()
-    engine.restore(engines.shifted.engine.snapshot())
-    engines.believe_from(engines.shifted.engine)
-    engines.believing.estimate = engines.shifted.estimate
+    engines.believing.estimate = estimate = engines.give(engine, engines.shifted)
+    engines.believe_from()
     state.suspect()
     if not is_certain:
         state.phase = Phase.UNCONFIRMED
         notes = [unconfirmed_note(name, left, LEFT) for name, left in state.shifts_k.items()]
-        return Judgement(engines.shifted.estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
+        return Judgement(estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
     then = f"{LEFT}, and is not used until its new value is confirmed"
     notes = [jump_note(name, left, then) for name, left in state.shifts_k.items()]
-    return Judgement(engines.shifted.estimate, notes, used)
+    return Judgement(estimate, notes, used)
 
 
 def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
@@ -106,13 +109,15 @@ def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
         state.shifts_k[name] = offered[name] - expected
         notes.append(unconfirmed_note(name, state.shifts_k[name], RESTED))
-    engine.restore(engines.believing.engine.snapshot())
+    estimate = engines.give(engine, engines.believing)
     state.phase = Phase.UNCONFIRMED
     state.samples, state.ratio = 0, 0.0
-    return Judgement(engines.believing.estimate, notes, {name: offered[name] for name in state.shifts_k})
+    return Judgement(estimate, notes, {name: offered[name] for name in state.shifts_k})
 
 
-def _accept(engine: Engine, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str) -> Judgement:
+def _accept(
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str
+) -> Judgement:
     names = list(state.shifts_k)
     notes = [
         Note(
@@ -122,10 +127,7 @@ def _accept(engine: Engine, state: JumpState, offered: Mapping[str, float], run:
         )
         for name in names
     ]
-    estimate = None
-    if run is not None:
-        engine.restore(run.engine.snapshot())
-        estimate = run.estimate
+    estimate = engines.give(engine, run) if run is not None else None
     return Judgement(estimate, notes, {name: offered[name] for name in names}, ends=True)
 
 
@@ -147,17 +149,16 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
-            return _accept(engine, state, offered, None, f"is confirmed: {by} with it")
+            return _accept(engine, engines, state, offered, None, f"is confirmed: {by} with it")
         if only_at and state.back.get("at_degc", 0) >= needed_samples(state):
             if state.left_k.get("at_degc"):
                 state.keep_what_is_left()
             elif engines.agree():
-                return _accept(engine, state, offered, None, "has returned to what was expected before")
+                return _accept(engine, engines, state, offered, None, "has returned to what was expected before")
         # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
         is_refuted |= is_contradicted(state) and not is_unsteady(state)
     if is_refuted:
-        engine.restore(engines.shifted.engine.snapshot())
-        estimate = engines.shifted.estimate
+        estimate = engines.give(engine, engines.shifted)
         if not is_back:
             notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
             state.suspect()

@@ -70,6 +70,7 @@ from compensator.service.plausibility.jump_engines import (
     Fed,
     JumpEngines,
     count_held,
+    grown,
     is_unsteady,
     moves,
     shifts_against,
@@ -125,11 +126,7 @@ class JumpWatch:
     @property
     def doubts(self) -> tuple[float, ...]:
         """As `doubt_um`, of each further output in its unit; empty where no channel is, or was, unconfirmed."""
-        answers = self._answers()
-        if answers is None:
-            return self._beside.doubts if self._beside is not None else ()
-        pairs = zip(*(answer.outputs for answer in answers), strict=True)
-        return tuple(abs(one.value - other.value) / math.sqrt(2.0) for one, other in pairs)
+        return tuple(self._apart()[1:])
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -146,10 +143,7 @@ class JumpWatch:
     @property
     def doubt_um(self) -> float:
         """Standard deviation by channels that are, or were, used unconfirmed, µm: either engine may be right."""
-        answers = self._answers()
-        if answers is None:
-            return self._beside.doubt_um if self._beside is not None else 0.0
-        return abs(answers[0].y_um - answers[1].y_um) / math.sqrt(2.0)
+        return next(iter(self._apart()), 0.0)
 
     @property
     def state(self) -> JumpState:
@@ -160,6 +154,7 @@ class JumpWatch:
             self._state,
             believing=self._engines.believing.branch(),
             shifted=self._engines.shifted.branch(),
+            used_zero=self._engines.used_zero,
             beside=self._beside.state if self._beside is not None else None,
         )
 
@@ -181,6 +176,7 @@ class JumpWatch:
             state,
             believing=None,
             shifted=None,
+            used_zero=None,
             beside=None,
             shifts_k=dict(state.shifts_k),
             shift_std_k=dict(state.shift_std_k),
@@ -192,12 +188,12 @@ class JumpWatch:
         )
 
     def reset(self, *, at_rest: bool) -> None:
-        """Forget the level of measured Y and jumps that are only watched; at rest unconfirmed channels, too."""
+        """Account for a zero: the level of Y is another one; at rest all is forgotten but what is not used."""
         self._state.level_um = NAN
-        if self._beside is not None:
-            self._beside.reset(at_rest=at_rest)
-        if not self._state.is_suspect and (at_rest or not self._state.is_unconfirmed):
+        if at_rest and not self._state.is_suspect:
             self._end()
+        if self._engines is not None:
+            self._engines.set_zero()
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
@@ -208,7 +204,7 @@ class JumpWatch:
         if self._beside is not None:
             self._beside.pass_time(samples, held=held)
 
-    def release(self, engine: Engine, *, new_zero: bool) -> tuple[list[str], Estimate | None]:
+    def release(self, engine: Engine, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
 
         Parameters
@@ -220,38 +216,51 @@ class JumpWatch:
 
         Returns
         -------
-        list of str
-            The channels.
-        Estimate or None
-            The estimate of the new state; None if nothing was suspect.
+        Judgement
+            The channels, whose values are not known, and the estimate of the new state.
         """
-        names, engines = list(self.suspects), self._engines
+        engines, used_zero = self._engines, self._used_zero
+        if engines is None:
+            return Judgement()
+        estimate: Estimate | None = None
         if self._state.is_unconfirmed and not new_zero:
-            other = engines.shifted if self._state.phase == Phase.AIR_RETURNED and engines is not None else None
-            if other is not None:  # it was the air: the engine that has believed it was right
-                engine.restore(other.engine.snapshot())
-            self._end()
-            return [], other.estimate if other is not None else None
-        if not names or engines is None:
-            return [], None
+            if self._state.phase == Phase.AIR_RETURNED:  # it was the air: the engine that has believed it was right
+                estimate = engines.give(engine, engines.shifted)
+            return self._released(used_zero, estimate)
+        if not self._state.is_suspect:
+            return Judgement()
+        names = self.suspects
         new_zero = new_zero and self._model.inputs == "changes"
         # Where both are suspect, the watch beside this one takes both less their jumps.
         beside = self._beside if self._beside is not None and self._beside.suspects else None
         shifted = beside._engines.shifted if beside is not None and beside._engines is not None else engines.shifted
-        run = shifted if new_zero else engines.believing
-        estimate: Estimate | None = run.estimate
         if new_zero and self._state.phase == Phase.SUSPECT_AFTER_USE:
             # What the engine has gone on from stays; its estimate does, too.
-            shifts, estimate = shifts_against(engine, self._state), None
+            shifts = shifts_against(engine, self._state)
         else:
             shifts = dict(self._state.shifts_k)
-            engine.restore(run.engine.snapshot())
+            estimate = engines.give(engine, shifted if new_zero else engines.believing)
         if beside is not None:
             shifts |= beside._state.shifts_k
         if new_zero:
             engine.shift_reference(shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0))
+        return self._released(used_zero, estimate, names)
+
+    def _released(
+        self, used_zero: Estimate | None, estimate: Estimate | None, names: tuple[str, ...] = ()
+    ) -> Judgement:
+        zeros = self._zeros(used_zero)
         self._end()
-        return names, estimate
+        return Judgement(estimate, accepted=dict.fromkeys(names, NAN), zeros=zeros)
+
+    @property
+    def _used_zero(self) -> Estimate | None:
+        return self._engines.used_zero if self._engines is not None else None
+
+    def _zeros(self, before: Estimate | None) -> tuple[Estimate, Estimate] | None:
+        """Return what the compensation's engine had estimated at the last zero, before and now; None if unchanged."""
+        now = self._used_zero
+        return (before, now) if before is not None and now is not None and now is not before else None
 
     def _end(self) -> None:
         self._engines = self._beside = None
@@ -259,7 +268,10 @@ class JumpWatch:
 
     def _go_on_with(self, beside: JumpWatch) -> None:
         """End the jump, and go on with that of the other channel."""
+        at_zero = self._used_zero
         self._state, self._engines, self._beside = beside._state, beside._engines, None
+        if self._engines is not None:
+            self._engines.believing.at_zero = self._engines.shifted.at_zero = self._engines.used_zero = at_zero
         self._state.quiet = 0
 
     # ------------------------------------------------------------------ one sample
@@ -294,6 +306,7 @@ class JumpWatch:
     ) -> Judgement:
         """Judge a sample of values, °C, of which some have `jumped` by their rate."""
         notes: list[Note] = []
+        used_zero = self._used_zero
         was_unconfirmed, was_new = self._state.is_unconfirmed, self._engines is None
         seen_again = self._seen_again(offered)
         if self._engines is not None and is_unsteady(self._state) and set(jumped) <= set(self._state.shifts_k):
@@ -342,11 +355,14 @@ class JumpWatch:
         is_suspect = self._state.is_suspect
         estimate = engines.go_without(engine, self._state, offered, others) if was_unconfirmed and is_suspect else None
         verdict = (suspected if is_suspect else watched)(engine, engines, self._state, offered)
+        zeros = self._zeros(used_zero)
         if verdict.has_returned and self._beside is not None and self._beside._state.shifts_k:
             self._go_on_with(self._beside)
         elif verdict.ends:
             self._end()
-        return Judgement(verdict.estimate or estimate, [*notes, *verdict.notes], beside.accepted | verdict.accepted)
+        return Judgement(
+            verdict.estimate or estimate, [*notes, *verdict.notes], beside.accepted | verdict.accepted, zeros=zeros
+        )
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
         """Compare both engines with a probe.
@@ -385,13 +401,16 @@ class JumpWatch:
         self._engines = JumpEngines.begin(self._model, engine.snapshot())
         self._state = state
 
-    def _answers(self) -> tuple[Estimate, Estimate] | None:
-        """Return both answers as long as a channel is, or was, used that nothing confirms."""
+    def _apart(self) -> list[float]:
+        """Return the standard deviation of Y and of each further output by both answers; empty where there is one."""
         state, engines = self._state, self._engines
         if engines is None or not (state.is_unconfirmed or state.phase == Phase.SUSPECT_AFTER_USE):
-            return None
+            return self._beside._apart() if self._beside is not None else []
         used, other = engines.believing.estimate if state.is_unconfirmed else self._estimate, engines.shifted.estimate
-        return (used, other) if used is not None and other is not None else None
+        if used is None or other is None:
+            return []
+        answers = grown(used, engines.used_zero), grown(other, engines.shifted.at_zero)
+        return [abs(one - another) / math.sqrt(2.0) for one, another in zip(*answers, strict=True)]
 
     def _use_no_longer(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
         """Suspect channels that jump again: what unconfirmed ones have shown is kept if nothing contradicts it."""
@@ -400,7 +419,7 @@ class JumpWatch:
         if was_used:
             state.age = 0
         else:
-            engine.restore(engines.shifted.engine.snapshot())
+            engines.give(engine, engines.shifted)
         self._state.suspect(Phase.SUSPECT_AFTER_USE if was_used else Phase.SUSPECT)
         self._believe_anew(engine, engines, offered)
 
@@ -408,7 +427,7 @@ class JumpWatch:
         """Let the believing engine begin with this jump: what was wrong before it is undone."""
         self._state.loose = self._state.age
         is_kept = self._state.phase == Phase.SUSPECT_AFTER_USE and engines.fits(engine, self._state, offered)
-        engines.believe_from(engine if is_kept else engines.shifted.engine)
+        engines.believe_from(engine if is_kept else None)
 
     def _unsettle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> list[Note]:
         """Account for a further jump of a loose contact."""
