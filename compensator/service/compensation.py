@@ -202,6 +202,8 @@ class Compensation(Continuity):
             before, now = found.zeros
             self._zero.y_base += now.y_um - before.y_um
             self.outputs.move_zero(before, now)
+            if self.probing is not None:
+                self.probing.move_zero(before.contributions_um, now.contributions_um)
 
     def _remember_sample(self, time_ns: int, estimate: Estimate) -> None:
         """Keep what a probe of this time is compared with."""
@@ -268,7 +270,7 @@ class Compensation(Continuity):
         zero.y_ref, zero.wanted = values.y, False
         self.outputs.set_zero(self._memory.estimate if warm else None, values.others)
         self.plausibility.reset(at_rest=not warm)
-        self._jumps.reset(at_rest=not warm)
+        self._jumps.set_zero(self._memory.estimate if warm else None, values.y)
         if self.probing is not None:
             at_zero = self._memory.estimate
             self.probing.set_zero(time_ns, at_zero.contributions_um if at_zero is not None else None)

@@ -190,7 +190,6 @@ class Continuity:
         try:
             engine.check(restored.engine)
             engine.restore(restored.engine)
-            self._jumps.restore(restored.jumps)
         except ValueError as error:
             raise DataError(f"state: {error}") from error
         estimate = restored.memory.estimate
@@ -198,6 +197,10 @@ class Continuity:
             raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
         if estimate is not None and len(estimate.outputs) != len(self.model.outputs):
             raise DataError(f"state: estimate of {len(estimate.outputs)} further outputs")
+        try:
+            self._jumps.restore(restored.jumps)
+        except ValueError as error:
+            raise DataError(f"state: {error}") from error
         if self.probing is not None and restored.probing is not None:
             self.probing.restore(restored.probing)
         self._engine, self._zero, self._memory = engine, restored.zero, restored.memory

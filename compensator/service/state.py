@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -145,13 +145,23 @@ def frozen_state(state: CompensationState) -> Callable[[], bytes]:
         if table[name] is None:
             del table[name]
     # As in versions that knew Y alone.
-    branches = [table["jumps"][name] for name in ("believing", "shifted")] if state.jumps is not None else []
-    for kept in (table["memory"], *filter(None, branches)):
-        if kept["estimate"] is not None and not kept["estimate"]["outputs"]:
-            del kept["estimate"]["outputs"]
-    for engine in (table["engine"], *(branch["engine"] for branch in branches if branch)):
+    jumps = list(_jumps_of(table.get("jumps")))
+    branches = [jump[name] for jump in jumps for name in ("believing", "shifted") if jump[name] is not None]
+    estimates = [table["memory"]["estimate"], *(jump["zero_in_use"] for jump in jumps)]
+    estimates += [branch[name] for branch in branches for name in ("estimate", "at_zero")]
+    for estimate in filter(None, estimates):
+        if not estimate.get("outputs", True):
+            del estimate["outputs"]
+    for engine in (table["engine"], *(branch["engine"] for branch in branches)):
         _leave_out_no_shift(engine)
     return lambda: json.dumps(_encodable(table), separators=(",", ":")).encode()
+
+
+def _jumps_of(jump: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
+    """Yield the tables of a watch for jumps and of the watch beside it."""
+    while jump is not None:
+        yield jump
+        jump = jump["beside"]
 
 
 def _leave_out_no_shift(engine: dict[str, Any]) -> None:
@@ -193,7 +203,7 @@ def decode_state(data: bytes) -> CompensationState:
         raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")
     engines = [state.engine]
     if state.jumps is not None:
-        engines += [branch.engine for branch in (state.jumps.believing, state.jumps.shifted) if branch is not None]
+        engines += [branch.engine for branch in state.jumps.branches()]
     nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
     numbers = [state.offset_um]
     numbers += [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]

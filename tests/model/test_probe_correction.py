@@ -252,6 +252,21 @@ def test_after_a_zero_the_gains_act_on_what_the_shares_grow_by():
     assert after.correction_um(now) == pytest.approx(sum(now) + 90.0, abs=3.0) and after.is_probed
 
 
+def test_other_shares_at_the_zero_leave_the_correction_at_the_zero_as_it_is():
+    """The state of the engine was wrong at the zero; the gains act on what the right shares grow by."""
+    found, *_ = run(lambda minute, now: 0.15 * now[0], hours=48.0)
+    wrong = shares(2880)
+    right = [wrong[0] - 25.0, wrong[1] + 3.0, *wrong[2:]]
+    after, known = found.at_zero(wrong), found.at_zero(right)
+    after.move_zero([b - a for a, b in zip(wrong, right, strict=True)])
+    for grown in (right, [right[0] - 60.0, *right[1:]]):
+        assert after.correction_um(grown) == pytest.approx(known.correction_um(grown), abs=1e-9)
+        assert after.std_um(grown) == pytest.approx(known.std_um(grown), rel=1e-6)
+    none = ProbeCorrection(NAMES)
+    none.move_zero([5.0] * len(NAMES))
+    assert none.to_dict() == ProbeCorrection(NAMES).to_dict()
+
+
 def test_a_zero_before_the_first_probe_changes_nothing():
     after = ProbeCorrection(NAMES).at_zero(shares(100))
     assert not after.active and after.to_dict() == ProbeCorrection(NAMES).to_dict()

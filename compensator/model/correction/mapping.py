@@ -31,6 +31,12 @@ def map_to_zero(before: KalmanBank, fresh: KalmanBank, contributions_um: Sequenc
     fresh.mean_weights = list(fresh.weights)
 
 
+def moved_zero(bank: KalmanBank, by_um: Sequence[float]) -> KalmanBank:
+    """Return a bank, changed, whose shares at the zero are larger by so much, µm, and its correction there the same."""
+    bank.x, bank.P = _mapped(_less(by_um, bank.x.shape[1]), bank.x, bank.P)
+    return bank
+
+
 def map_to_model(
     before: KalmanBank,
     fresh: KalmanBank,

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from compensator.model.correction.kalman_bank import KalmanBank, Observation
-from compensator.model.correction.mapping import map_to_model, map_to_zero
+from compensator.model.correction.mapping import map_to_model, map_to_zero, moved_zero
 from compensator.model.correction.mixture import mixed, weighted
 from compensator.model.correction.probation import Probation
 from compensator.model.correction.refused import AGREEING, ComparedProbe, agreeing
@@ -307,6 +307,20 @@ class ProbeCorrection:
         found._probation = self._probation.changed(self._waiting, zeroed)
         found._mix()
         return found
+
+    def move_zero(self, by_um: Sequence[float]) -> None:
+        """Account for other shares at the zero: the correction at the zero stays what it was.
+
+        Parameters
+        ----------
+        by_um : sequence of float
+            By how much the shares of the paths and effects at the zero are larger than it was thought, µm.
+        """
+        self._expect(by_um)
+        if self.active:
+            self._probation = self._probation.changed(self._waiting, lambda bank: moved_zero(bank, by_um))
+            self._waiting = 0.0
+            self._mix()
 
     def transferred(
         self,

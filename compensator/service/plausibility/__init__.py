@@ -3,8 +3,8 @@
 from compensator.service.plausibility.checks import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.plausibility.guards import HEATED_W, SensorGuards
 from compensator.service.plausibility.jump_state import JumpState
-from compensator.service.plausibility.jump_verdict import Judgement
 from compensator.service.plausibility.jumps import JumpWatch
+from compensator.service.plausibility.one_jump import Judgement
 
 __all__ = [
     "BLOCK_SAMPLES",

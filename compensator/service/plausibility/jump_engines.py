@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -84,12 +84,18 @@ class JumpEngines:
     ----------
     believing, shifted : Run
         The engines.
-    used_zero : Estimate, optional
+    zero_in_use : Estimate, optional
         What the compensation's engine had estimated at a zero on a warm machine, if one was set since they run.
+
+    Attributes
+    ----------
+    has_given : bool
+        Whether the compensation's engine was given the state of one of them in this sample.
     """
 
-    def __init__(self, believing: Run, shifted: Run, used_zero: Estimate | None = None) -> None:
-        self.believing, self.shifted, self.used_zero = believing, shifted, used_zero
+    def __init__(self, believing: Run, shifted: Run, zero_in_use: Estimate | None = None) -> None:
+        self.believing, self.shifted, self.zero_in_use = believing, shifted, zero_in_use
+        self.has_given = False
 
     @classmethod
     def begin(cls, model: ThermalModel, state: EngineState) -> JumpEngines:
@@ -110,19 +116,39 @@ class JumpEngines:
         """
         believing, shifted = (_run_of(model, branch) for branch in (state.believing, state.shifted))
         are_both = believing is not None and shifted is not None
-        if are_both != bool(state.shifts_k) or not set(state.shifts_k) <= set(TEMPERATURES):
+        is_open = bool(state.shifts_k)
+        if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.shifts_k) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
-        return cls(believing, shifted, state.used_zero) if believing is not None and shifted is not None else None
+        if state.beside is not None and not (state.is_suspect and len(state.shifts_k) == 1):
+            raise ValueError("state of a jump beside none")
+        if believing is None or shifted is None:
+            return None
+        return cls(believing, shifted, _checked(model, state.zero_in_use))
 
-    def set_zero(self) -> None:
-        """Count what each of them predicts from the last sample on: a zero is not of one of two answers."""
+    def set_zero(self, used: Estimate | None) -> None:
+        """Count what each of them predicts from the last sample on: a zero is not of one of two answers.
+
+        Parameters
+        ----------
+        used : Estimate or None
+            That of the compensation's engine.
+        """
         self.believing.at_zero, self.shifted.at_zero = self.believing.estimate, self.shifted.estimate
-        self.used_zero = self.believing.at_zero
+        self.zero_in_use = used
+
+    def take_zero(self, at_zero: Estimate | None) -> None:
+        """Count from a zero on that is older than they are."""
+        self.believing.at_zero = self.shifted.at_zero = self.zero_in_use = at_zero
+
+    def shift_reference(self, t_q_k: float, at_k: float) -> None:
+        """Account for another zero of the sensors, K."""
+        for run in (self.believing, self.shifted):
+            run.engine.shift_reference(t_q_k, at_k)
 
     def give(self, engine: Engine, run: Run) -> Estimate | None:
         """Give the compensation's engine the state of one of them, with its zero, and return its estimate."""
         engine.restore(run.engine.snapshot())
-        self.used_zero = run.at_zero
+        self.zero_in_use, self.has_given = run.at_zero, True
         return run.estimate
 
     def pass_time(self, samples: int, *, held: bool) -> None:
@@ -130,40 +156,47 @@ class JumpEngines:
         for run in (self.believing, self.shifted):
             run.estimate = run.engine.skip(samples, held=held)
 
-    def believe_from(self, engine: Engine | None = None) -> None:
-        """Let the believing engine go on from the compensation's, or from the shifted one: the channel jumps again."""
-        self.believing.engine.restore((engine or self.shifted.engine).snapshot())
-        self.believing.at_zero = self.used_zero if engine is not None else self.shifted.at_zero
+    def believe_from_used(self, engine: Engine) -> None:
+        """Let the believing engine go on from the compensation's: the channel jumps again."""
+        self.believing.engine.restore(engine.snapshot())
+        self.believing.at_zero = self.zero_in_use
+
+    def believe_from_shifted(self) -> None:
+        """Let the believing engine go on from the shifted one: the channel jumps again, or what it showed was wrong."""
+        self.believing.engine.restore(self.shifted.engine.snapshot())
+        self.believing.at_zero = self.shifted.at_zero
 
     def go_without(
-        self, engine: Engine, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
+        self, engine: Engine, suspects: Sequence[str], offered: Mapping[str, float], others: Mapping[str, float]
     ) -> Estimate:
-        """Step the compensation's engine without the channels that have jumped, and let it bridge as long as these do.
+        """Step the compensation's engine without suspect channels, and let it bridge as long as these engines do.
 
         Parameters
         ----------
         engine : Engine
             Engine of the compensation.
-        state : JumpState
-            State of the watch.
+        suspects : sequence of str
+            Channels that are not used.
         offered, others : mapping of str to float
             Measured temperatures, °C, and usable values of the auxiliary channels.
         """
         without = Engine(engine.model, bridge_samples=BRIDGED_SAMPLES)
         without.restore(engine.snapshot())
-        values = {name: NAN if name in state.shifts_k else value for name, value in offered.items()}
+        values = {name: NAN if name in suspects else value for name, value in offered.items()}
         estimate = without.step(values["t_q_degc"], values["at_degc"], others)
         engine.restore(without.snapshot())
         return estimate
 
     def step(
-        self, offered: Mapping[str, float], fed: Fed, others: Mapping[str, float], stepped: Estimate | None
+        self,
+        offered: Mapping[str, float],
+        fed: Mapping[str, float],
+        others: Mapping[str, float],
+        stepped: Estimate | None,
     ) -> None:
-        """Step both by a sample; `stepped` is the estimate of the shifted one if it already is."""
+        """Step both by a sample, each by its values; `stepped` is the estimate of the shifted one if it already is."""
         self.believing.estimate = self.believing.engine.step(offered["t_q_degc"], offered["at_degc"], others)
-        self.shifted.estimate = stepped or self.shifted.engine.step(
-            fed.values["t_q_degc"], fed.values["at_degc"], others
-        )
+        self.shifted.estimate = stepped or self.shifted.engine.step(fed["t_q_degc"], fed["at_degc"], others)
 
     def feed(
         self,
@@ -268,21 +301,20 @@ class JumpEngines:
         one = self.believing.estimate
         return one is not None and abs(self.believing.grown_um - self.shifted.grown_um) <= one.y_std_um
 
-    def speaks(self, y_um: float, std_um: float) -> int:
+    def speaks(self, grown_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
 
         Parameters
         ----------
-        y_um, std_um : float
-            Y on the scale of the compensation's prediction, and its standard deviation, µm.
+        grown_um, std_um : float
+            Deformation since the zero by that value, and its standard deviation, µm.
 
         Returns
         -------
         int
             1 for the believing engine, -1 for the shifted one, 0 for neither.
         """
-        y_um -= self.used_zero.y_um if self.used_zero is not None else 0.0
-        believing, shifted = (abs(y_um - run.grown_um) / std_um for run in (self.believing, self.shifted))
+        believing, shifted = (abs(grown_um - run.grown_um) / std_um for run in (self.believing, self.shifted))
         if believing < _FITS and shifted > believing + _CONTRADICTS:
             return 1
         return -1 if shifted < max(_FITS, _FITS_PART * believing) and believing > shifted + _CONTRADICTS else 0
@@ -415,5 +447,12 @@ def _run_of(model: ThermalModel, branch: Branch | None) -> Run | None:
     run = _new_run(model)
     run.engine.check(branch.engine)
     run.engine.restore(branch.engine)
-    run.estimate, run.at_zero = branch.estimate, branch.at_zero
+    run.estimate, run.at_zero = _checked(model, branch.estimate), _checked(model, branch.at_zero)
     return run
+
+
+def _checked(model: ThermalModel, estimate: Estimate | None) -> Estimate | None:
+    """Return an estimate of a state if it can be one of the model."""
+    if estimate is not None and len(estimate.outputs) != len(model.outputs):
+        raise ValueError(f"state of a jump with {len(estimate.outputs)} further outputs")
+    return estimate

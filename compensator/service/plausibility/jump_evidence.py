@@ -17,30 +17,30 @@ _Y_SAMPLES = 10
 _PROBES = 2
 
 
-def weigh_y(state: JumpState, engines: JumpEngines, y_um: float, std_um: float) -> None:
+def weigh_y(state: JumpState, engines: JumpEngines, grown_um: float, std_um: float) -> None:
     """Count the samples for which measured Y has spoken for one engine.
 
     Parameters
     ----------
     state : JumpState
-        State of the watch, which keeps the counts and the level of Y before the jump.
+        State of the watch, which keeps the counts.
     engines : JumpEngines
         The two engines.
-    y_um, std_um : float
-        Measured Y, NaN if it cannot be used, and its standard deviation, µm.
+    grown_um, std_um : float
+        Deformation since the zero by measured Y, NaN if it is not known, and its standard deviation, µm.
     """
-    if math.isnan(y_um) or math.isnan(state.level_um) or not std_um > 0.0:
+    if math.isnan(grown_um) or not std_um > 0.0:
         return
-    speaks = engines.speaks(y_um - state.level_um, std_um)
+    speaks = engines.speaks(grown_um, std_um)
     state.y_for = state.y_for + 1 if speaks > 0 else 0
     state.y_against = state.y_against + 1 if speaks < 0 else 0
 
 
-def weigh_probe(state: JumpState, engines: JumpEngines, y_um: float, std_um: float) -> None:
-    """Count a probe if it speaks for one engine; its value is on the scale of the prediction, NaN without one, µm."""
-    if not (state.is_suspect or state.is_unconfirmed) or math.isnan(y_um):
+def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um: float) -> None:
+    """Count a probe if it speaks for one engine: deformation since the zero and standard deviation, µm."""
+    if not (state.is_suspect or state.is_unconfirmed) or math.isnan(grown_um):
         return
-    speaks = engines.speaks(y_um, std_um)
+    speaks = engines.speaks(grown_um, std_um)
     state.probes_for += speaks > 0
     state.probes_against += speaks < 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from enum import StrEnum
 
 import msgspec
@@ -46,7 +47,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     Parameters
     ----------
     level_um : float
-        Mean of measured Y − prediction over the last samples, µm: what a jump is compared with.
+        Mean of measured Y − prediction over the last samples, or Y at a zero since a jump, µm; of the watch as a whole.
     shifts_k : dict of str to float
         By channel that has jumped: measured − expected, K. Empty if none has.
     shift_std_k : dict of str to float
@@ -85,7 +86,7 @@ class JumpState(msgspec.Struct, kw_only=True):
         Probes that have spoken for them.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
-    used_zero : Estimate, optional
+    zero_in_use : Estimate, optional
         What the compensation's engine had estimated at a zero on a warm machine since then.
     beside : JumpState, optional
         State of the watch of the other channel, while one is suspect.
@@ -115,7 +116,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
-    used_zero: Estimate | None = None
+    zero_in_use: Estimate | None = None
     beside: JumpState | None = None
 
     @property
@@ -162,16 +163,17 @@ class JumpState(msgspec.Struct, kw_only=True):
     def begun(self, phase: Phase) -> JumpState:
         """Return the state when a channel has jumped, or may have while it was not seen."""
         again = self.again + (phase == Phase.SUSPECT) if self.quiet < FORGOTTEN_SAMPLES else 0
-        return JumpState(
-            level_um=self.level_um,
-            quiet=self.quiet,
-            phase=phase,
-            unseen=self.unseen,
-            again=again,
-        )
+        return JumpState(quiet=self.quiet, phase=phase, unseen=self.unseen, again=again)
 
     def ended(self) -> JumpState:
-        """Return the state when all channels are used again; the level of Y − prediction is another one then."""
-        if self.is_suspect:
-            return JumpState(unseen=self.unseen, again=self.again, quiet=0)
-        return JumpState(level_um=self.level_um, unseen=self.unseen, again=self.again, quiet=self.quiet)
+        """Return the state when all channels are used again."""
+        return JumpState(unseen=self.unseen, again=self.again, quiet=0 if self.is_suspect else self.quiet)
+
+    def without_engines(self) -> JumpState:
+        """Return a copy without the states of the engines and of the watch beside."""
+        return copy.deepcopy(msgspec.structs.replace(self, believing=None, shifted=None, zero_in_use=None, beside=None))
+
+    def branches(self) -> list[Branch]:
+        """Return the states of all engines, those of the watch beside included."""
+        own = [branch for branch in (self.believing, self.shifted) if branch is not None]
+        return own + (self.beside.branches() if self.beside is not None else [])

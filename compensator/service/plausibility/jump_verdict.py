@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import msgspec
@@ -24,8 +25,8 @@ from compensator.service.plausibility.jump_state import JumpState, Phase
 WATCHED_SAMPLES = 15
 
 
-class Judgement(msgspec.Struct, frozen=True):
-    """What a sample has shown.
+class Verdict(msgspec.Struct, frozen=True):
+    """What a sample has shown of the channels that have jumped.
 
     Parameters
     ----------
@@ -36,12 +37,9 @@ class Judgement(msgspec.Struct, frozen=True):
     accepted : dict of str to float
         Channels that are used again, with their values, °C.
     ends : bool
-        Whether the jump is over: all channels are used as they are.
+        Whether the jump is over: they are used as they are.
     has_returned : bool
         Whether that is because they are where the shifted engine expects them.
-    zeros : tuple of Estimate, optional
-        What the engine had estimated at the last zero, before and since it was given another state; None if that is
-        the same.
     """
 
     estimate: Estimate | None = None
@@ -49,10 +47,11 @@ class Judgement(msgspec.Struct, frozen=True):
     accepted: dict[str, float] = {}
     ends: bool = False
     has_returned: bool = False
-    zeros: tuple[Estimate, Estimate] | None = None
 
 
-def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+def suspected(
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], *, is_alone: bool
+) -> Verdict:
     """Decide whether channels that are not used are used again, and from which engine on.
 
     Parameters
@@ -65,11 +64,15 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
         State of the watch.
     offered : mapping of str to float
         Measured temperatures, °C.
+    is_alone : bool
+        Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
     needed = needed_samples(state)
-    if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
+    if all(state.back.get(name, 0) >= needed and not math.isnan(offered[name]) for name in state.shifts_k):
+        if any(state.left_k.values()) and is_unsteady(state):
+            return _settle(engine, engines, state, offered) if is_alone else Verdict()
         if any(state.left_k.values()):
-            return (_settle if is_unsteady(state) else _keep_what_is_left)(engine, engines, state, offered)
+            return _keep_what_is_left(engine, engines, state, offered, is_alone=is_alone)
         found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
         return msgspec.structs.replace(found, has_returned=True)
     if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
@@ -77,32 +80,32 @@ def suspected(engine: Engine, engines: JumpEngines, state: JumpState, offered: M
     by = confirmed_by(state)
     if by:
         return _accept(engine, engines, state, offered, engines.believing, f"is used again: {by} with it")
-    if is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
+    if is_alone and is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
         return _settle(engine, engines, state, offered)
-    return Judgement()
+    return Verdict()
 
 
 def _keep_what_is_left(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]
-) -> Judgement:
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], *, is_alone: bool = True
+) -> Verdict:
     """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
     used = {name: offered[name] for name in state.shifts_k if not state.left_k.get(name)}
     # How far it had jumped was as uncertain as what was expected then.
     is_certain = any(abs(left) > NEAR * state.shift_std_k.get(name, 0.0) for name, left in state.left_k.items())
     state.keep_what_is_left()
     engines.believing.estimate = estimate = engines.give(engine, engines.shifted)
-    engines.believe_from()
+    engines.believe_from_shifted()
     state.suspect()
-    if not is_certain:
+    if is_alone and not is_certain:
         state.phase = Phase.UNCONFIRMED
         notes = [unconfirmed_note(name, left, LEFT) for name, left in state.shifts_k.items()]
-        return Judgement(estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
+        return Verdict(estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
     then = f"{LEFT}, and is not used until its new value is confirmed"
     notes = [jump_note(name, left, then) for name, left in state.shifts_k.items()]
-    return Judgement(estimate, notes, used)
+    return Verdict(estimate, notes, used)
 
 
-def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Verdict:
     """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
     notes = []
     for name in state.shifts_k:
@@ -111,13 +114,13 @@ def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         notes.append(unconfirmed_note(name, state.shifts_k[name], RESTED))
     estimate = engines.give(engine, engines.believing)
     state.phase = Phase.UNCONFIRMED
-    state.samples, state.ratio = 0, 0.0
-    return Judgement(estimate, notes, {name: offered[name] for name in state.shifts_k})
+    state.start_evidence()
+    return Verdict(estimate, notes, {name: offered[name] for name in state.shifts_k})
 
 
 def _accept(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str
-) -> Judgement:
+) -> Verdict:
     names = list(state.shifts_k)
     notes = [
         Note(
@@ -128,10 +131,10 @@ def _accept(
         for name in names
     ]
     estimate = engines.give(engine, run) if run is not None else None
-    return Judgement(estimate, notes, {name: offered[name] for name in names}, ends=True)
+    return Verdict(estimate, notes, {name: offered[name] for name in names}, ends=True)
 
 
-def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Judgement:
+def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Verdict:
     """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor.
 
     Parameters
@@ -143,7 +146,7 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     is_back = all(state.back.get(name, 0) > 0 for name in state.shifts_k)
     if only_at and is_refuted and not is_back and not state.is_unconfirmed:
         state.phase = Phase.AIR
-        return Judgement(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
+        return Verdict(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
     # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
     is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
     if state.is_unconfirmed:
@@ -162,16 +165,16 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         if not is_back:
             notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
             state.suspect()
-            return Judgement(estimate, notes)
+            return Verdict(estimate, notes)
         if any(state.left_k.values()) and not only_at:
             return _keep_what_is_left(engine, engines, state, offered)
         notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
         if not only_at or (engines.agree() and not any(state.left_k.values())):
-            return Judgement(estimate, notes, ends=True)
+            return Verdict(estimate, notes, ends=True)
         # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
         engines.swap()
         state.keep_what_is_left()
         state.phase = Phase.AIR_RETURNED
         state.start_evidence()
-        return Judgement(estimate, notes)
-    return Judgement(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
+        return Verdict(estimate, notes)
+    return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)

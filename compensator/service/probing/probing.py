@@ -166,6 +166,10 @@ class Probing:
         self._correction = self._correction.at_zero(contributions_um or [0.0] * len(self._names))
         self._state = ProbingState(correction={}, known=self._state.known, zero_ns=time_ns)
 
+    def move_zero(self, before_um: Sequence[float], now_um: Sequence[float]) -> None:
+        """Account for other shares of each path and effect at the zero: the engine's state was wrong then."""
+        self._correction.move_zero([now - before for before, now in zip(before_um, now_um, strict=True)])
+
     def pass_time(self, contributions_um: Sequence[float], minutes: float) -> None:
         """Advance over samples that were not measured."""
         self._correction.step(contributions_um, minutes)

@@ -1,0 +1,527 @@
+"""The watch for one jump: of the channels that jump together, and of the other one beside them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+
+from compensator.arrays import NAN
+from compensator.events import Note
+from compensator.model.engine import Engine, Estimate
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.plausibility.guards import TEMPERATURES
+from compensator.service.plausibility.jump_engines import (
+    UNSEEN_SAMPLES,
+    Fed,
+    JumpEngines,
+    count_held,
+    grown,
+    is_unsteady,
+    moves,
+    shifts_against,
+)
+from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
+from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState, Phase
+from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
+
+
+class Judgement(msgspec.Struct, frozen=True):
+    """What a sample, or an operator, changes in the compensation.
+
+    Parameters
+    ----------
+    estimate : Estimate, optional
+        The estimate after this sample, if the engine was given another state or is stepped; None if it is as before.
+    notes : list of Note
+        Events.
+    accepted : dict of str to float
+        Channels that are used again, with their values, °C.
+    zeros : tuple of Estimate, optional
+        What the engine had estimated at the last zero, before and since it was given another state; None if that is
+        the same.
+    gives : bool
+        Whether the engine was given another state.
+    """
+
+    estimate: Estimate | None = None
+    notes: list[Note] = []
+    accepted: dict[str, float] = {}
+    zeros: tuple[Estimate, Estimate] | None = None
+    gives: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What every watch of a machine shares.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The model.
+    signs : JumpSigns, optional
+        Finds jumps within the permitted rate and unseen ones; None without `guards.jump_min_k`.
+    least_k : float
+        Smallest jump that is looked for, K; infinite without.
+    change_k : dict of str to float
+        By channel: part of the permitted change of a sample that the temperature itself makes, K.
+    y_std_um : float
+        Standard deviation of measured Y − prediction, µm.
+    """
+
+    model: ThermalModel
+    signs: JumpSigns | None
+    least_k: float
+    change_k: dict[str, float]
+    y_std_um: float
+
+
+class OneJump:
+    """Watches channels for a jump, and decides what it was.
+
+    Parameters
+    ----------
+    setup : Setup
+        What every watch of the machine shares.
+    names : tuple of str
+        The channels that may jump here.
+    """
+
+    def __init__(self, setup: Setup, names: tuple[str, ...] = TEMPERATURES) -> None:
+        self._setup, self._names = setup, names
+        self.state = JumpState()
+        self._engines: JumpEngines | None = None
+        self._beside: OneJump | None = None
+        #: What the engine that is judged had estimated at a zero on a warm machine before this jump.
+        self._at_zero: Estimate | None = None
+
+    # ------------------------------------------------------------------ state
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a channel has jumped, or may have."""
+        return bool(self.state.shifts_k)
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Channels that are not used."""
+        own = tuple(self.state.shifts_k) if self.state.is_suspect else ()
+        return own + (self._beside.suspects if self._beside is not None else ())
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Channels that are used, and may have another zero since samples without them."""
+        own = tuple(self.state.shifts_k) if self.state.is_unconfirmed else ()
+        return own + (self._beside.unconfirmed if self._beside is not None else ())
+
+    def doubts(self, used: Estimate | None) -> list[float]:
+        """Return the standard deviation of Y and of each further output by both answers; empty where there is one.
+
+        Parameters
+        ----------
+        used : Estimate, optional
+            That of the engine whose samples are judged here.
+        """
+        state, engines = self.state, self._engines
+        if engines is None:
+            return []
+        if not (state.is_unconfirmed or state.phase == Phase.SUSPECT_AFTER_USE):
+            return self._beside.doubts(engines.shifted.estimate) if self._beside is not None else []
+        if used is None or engines.shifted.estimate is None:
+            return []
+        answers = grown(used, engines.zero_in_use), grown(engines.shifted.estimate, engines.shifted.at_zero)
+        return [abs(one - other) / math.sqrt(2.0) for one, other in zip(*answers, strict=True)]
+
+    def snapshot(self) -> JumpState:
+        """Return the state with that of its engines, and of the watch beside."""
+        if self._engines is None:
+            return msgspec.structs.replace(self.state)
+        return msgspec.structs.replace(
+            self.state,
+            believing=self._engines.believing.branch(),
+            shifted=self._engines.shifted.branch(),
+            zero_in_use=self._engines.zero_in_use,
+            beside=self._beside.snapshot() if self._beside is not None else None,
+        )
+
+    @classmethod
+    def restored(cls, setup: Setup, state: JumpState, names: tuple[str, ...] = TEMPERATURES) -> OneJump:
+        """Return the watch of a state.
+
+        Raises
+        ------
+        ValueError
+            If it does not belong to the model, or is incomplete.
+        """
+        found = cls(setup, names)
+        found._engines = JumpEngines.restored(setup.model, state)
+        if state.beside is not None:
+            found._beside = cls.restored(setup, state.beside, _others(state))
+            found._beside._at_zero = found._engines.shifted.at_zero if found._engines is not None else None
+        found.state = state.without_engines()
+        return found
+
+    def set_zero(self, used: Estimate | None) -> None:
+        """Count from a zero on a warm machine on what each engine predicts; `used` is that of the compensation."""
+        if self._engines is not None:
+            self._engines.set_zero(used)
+
+    def pass_time(self, samples: int, *, held: bool) -> None:
+        """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
+        unseen = self.state.unseen
+        self.state.unseen = {} if held else {name: unseen.get(name, 0) + samples for name in self._names}
+        self.state.start_counts()
+        if self._engines is not None:
+            self._engines.pass_time(samples, held=held)
+        if self._beside is not None:
+            self._beside.pass_time(samples, held=held)
+
+    def count_quiet(self) -> None:
+        """Count a sample without a jump under way."""
+        self.state.quiet = min(self.state.quiet + 1, FORGOTTEN_SAMPLES)
+
+    def end(self) -> None:
+        """Use all channels as they are."""
+        self._engines = self._beside = None
+        self.state = self.state.ended()
+
+    # ------------------------------------------------------------------ what others say
+
+    @property
+    def zero_in_use(self) -> Estimate | None:
+        """What the compensation's engine had estimated at a zero on a warm machine since this jump; None without."""
+        return self._engines.zero_in_use if self._engines is not None else None
+
+    def receive_probe(self, grown_um: float, std_um: float) -> None:
+        """Compare both engines with the deformation since the zero by a probe, and its standard deviation, µm."""
+        if self._engines is not None:
+            weigh_probe(self.state, self._engines, grown_um, std_um)
+        if self._beside is not None:
+            self._beside.receive_probe(grown_um, std_um)
+
+    def release(self, engine: Engine, *, new_zero: bool) -> Judgement:
+        """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
+
+        Parameters
+        ----------
+        engine : Engine
+            Engine of the compensation; its state becomes that of one of the two engines.
+        new_zero : bool
+            Whether the sensors have another zero from now on; otherwise their values are believed since the jump.
+
+        Returns
+        -------
+        Judgement
+            The channels, whose values are not known, and the estimate of the new state.
+        """
+        engines, state, before = self._engines, self.state, self.zero_in_use
+        if engines is None:
+            return Judgement()
+        new_zero = new_zero and self._setup.model.inputs == "changes"
+        estimate: Estimate | None = None
+        accepted: dict[str, float] = {}
+        if state.is_suspect and new_zero:
+            accepted, estimate = self._take_as_zero(engine, engines)
+        elif state.is_suspect:
+            accepted = dict.fromkeys(self.suspects, NAN)
+            estimate = engines.give(engine, engines.believing)
+            self.end()
+        elif not new_zero and state.is_unconfirmed:
+            if state.phase == Phase.AIR_RETURNED:  # it was the air: the engine that has believed it was right
+                estimate = engines.give(engine, engines.shifted)
+            self.end()
+        return Judgement(estimate, accepted=accepted, zeros=_moved(before, engines.zero_in_use))
+
+    def _take_as_zero(self, engine: Engine, engines: JumpEngines) -> tuple[dict[str, float], Estimate | None]:
+        """Give suspect channels another zero; the other one stays in question if it is."""
+        names, beside, keeps = self.suspects, self._beside, self.state.phase == Phase.SUSPECT_AFTER_USE
+        # What the engine has gone on from after its use stays; its estimate does, too.
+        shifts = shifts_against(engine, self.state) if keeps else dict(self.state.shifts_k)
+        shifted = engines.shifted
+        if beside is not None and beside.suspects and beside._engines is not None:
+            # The watch beside takes both less their jumps.
+            shifts, shifted, beside = shifts | beside.state.shifts_k, beside._engines.shifted, None
+        estimate = None if keeps else engines.give(engine, shifted)
+        moved = shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0)
+        engine.shift_reference(*moved)
+        if beside is not None and beside.is_open:
+            if keeps or beside._engines is None:
+                beside._begin_engines(engine)
+            else:
+                beside._engines.shift_reference(*moved)
+            self._go_on_with(beside)
+        else:
+            self.end()
+        return dict.fromkeys(names, NAN), estimate
+
+    # ------------------------------------------------------------------ one sample
+
+    def judge(
+        self,
+        engine: Engine,
+        measured: Mapping[str, float],
+        fast: list[str],
+        others: Mapping[str, float],
+        grown_um: float,
+    ) -> Judgement:
+        """Judge a sample before the step of the engine that it is for.
+
+        Parameters
+        ----------
+        engine : Engine
+            That of the compensation; of a watch beside: the shifted engine of the jump that it stands beside.
+        measured : mapping of str to float
+            T_Q and AT, °C; NaN where they cannot be used.
+        fast : list of str
+            Channels that have moved beyond their permitted rate.
+        others : mapping of str to float
+            Usable values of the auxiliary channels.
+        grown_um : float
+            Deformation since the zero by measured Y, µm; NaN if it is not known.
+        """
+        before, was_unconfirmed, was_new = self.zero_in_use, self.state.is_unconfirmed, self._engines is None
+        if self._engines is not None:
+            self._engines.has_given = False
+        own = [name for name in fast if name in self._names and not self._is_for_beside(name)]
+        # A channel that the watch beside takes as wrong, or will, is missing here.
+        offered = {
+            name: NAN if name in self._beside_suspects or (name in fast and name not in own) else value
+            for name, value in measured.items()
+        }
+        seen_again = self._seen_again(measured)
+        jumped, notes = self._jumped(engine, offered, own, seen_again)
+        engines = self._engines
+        if engines is None:
+            return Judgement()
+        self.state.last |= {name: measured[name] for name in TEMPERATURES if not math.isnan(measured[name])}
+        fed = engines.feed(self.state, offered, jumped, self._setup.change_k, self._setup.least_k)
+        count_held(self.state, engine, offered["at_degc"], self._setup.least_k)
+        new = [name for name in fed.jumped if was_new or name in seen_again]
+        notes += self._entered(engine, engines, offered, fed, [name for name in jumped if name in fed.jumped], new)
+        engines.weigh(self.state, offered, fed)
+        beside = self._judge_beside(engines, measured, fast, fed, others, grown_um)
+        offered |= dict.fromkeys(self._beside_suspects, NAN)
+        engines.step(offered, fed.values | dict.fromkeys(self._beside_suspects, NAN), others, beside.estimate)
+        self.state.samples += 1
+        self.state.age += 1
+        weigh_y(self.state, engines, grown_um, self._setup.y_std_um)
+        estimate: Estimate | None = None
+        if beside.gives:
+            # What the other channel has shown is undone in the engine that goes on without this one, too.
+            estimate = engines.give(engine, engines.shifted)
+            self.state.phase = Phase.SUSPECT
+        elif was_unconfirmed and self.state.is_suspect:
+            estimate = engines.go_without(engine, self.suspects, offered, others)
+        verdict = self._verdict(engine, engines, offered)
+        estimate = verdict.estimate or estimate
+        if verdict.ends:
+            estimate = self._finish(engine, verdict, estimate, offered, others)
+        elif not self.state.is_suspect:
+            self._beside = None
+        return Judgement(
+            estimate,
+            [*notes, *beside.notes, *verdict.notes],
+            beside.accepted | verdict.accepted,
+            _moved(before, engines.zero_in_use),
+            engines.has_given,
+        )
+
+    def _jumped(
+        self, engine: Engine, offered: Mapping[str, float], fast: list[str], seen_again: list[str]
+    ) -> tuple[list[str], list[Note]]:
+        """Return the channels that jump in this sample, and events; a watch begins with the first."""
+        state, engines, jumped, notes = self.state, self._engines, fast, list[Note]()
+        if engines is not None and is_unsteady(state) and set(fast) <= set(state.shifts_k):
+            if fast or moves(state, offered, self._setup.change_k):
+                notes = self._unsettle(engine, engines, offered)
+        elif engines is not None and fast and not state.is_suspect:
+            self._use_no_longer(engine, engines, offered)
+        elif fast and not state.is_suspect:
+            self._begin(engine, Phase.SUSPECT)
+        elif not state.shifts_k:
+            hidden = self._unexpected(engine, offered, seen_again)
+            jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
+            if jumped:
+                self._begin(engine, Phase.UNCONFIRMED if hidden else Phase.WATCHED)
+        elif engines is not None and state.is_watched:
+            jumped = self._going_on(engines, offered)
+            if state.is_air and "t_q_degc" in self._watchable(engine, offered):
+                # One of both is wrong: what T_Q has shown of AT counts no more, nor AT of T_Q.
+                state.phase = Phase.UNCONFIRMED
+                state.start_evidence()
+                jumped = ["t_q_degc", *jumped]
+        if self.state.shifts_k:
+            known = {*jumped, *self.state.shifts_k}
+            unexpected = self._unexpected(engine, offered, seen_again)
+            jumped = [*jumped, *(n for n in unexpected if n not in known and not self._is_for_beside(n))]
+        return jumped, notes
+
+    def _entered(
+        self,
+        engine: Engine,
+        engines: JumpEngines,
+        offered: Mapping[str, float],
+        fed: Fed,
+        told: list[str],
+        unseen: list[str],
+    ) -> list[Note]:
+        """Account for the jumps of a sample, and return the events of those that are `told`, some of them `unseen`."""
+        state = self.state
+        if not fed.jumped:
+            return []
+        if state.is_suspect:
+            self._believe_anew(engine, engines, offered)
+            state.start_evidence()
+            return [jump_note(name, state.shifts_k[name]) for name in told]
+        if not state.is_unconfirmed:
+            return []
+        when = {name: AIR if state.is_air else UNSEEN if name in unseen else BESIDE for name in fed.jumped}
+        return [unconfirmed_note(name, state.shifts_k[name], when[name]) for name in fed.jumped]
+
+    def _verdict(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Verdict:
+        if not self.state.is_suspect:
+            return watched(engine, engines, self.state, offered)
+        is_alone = self._beside is None or not self._beside.is_open
+        return suspected(engine, engines, self.state, offered, is_alone=is_alone)
+
+    def _finish(
+        self,
+        engine: Engine,
+        verdict: Verdict,
+        estimate: Estimate | None,
+        offered: Mapping[str, float],
+        others: Mapping[str, float],
+    ) -> Estimate | None:
+        """End the jump, and go on with that of the other channel if there is one; return the estimate of the sample."""
+        beside = self._beside
+        if beside is None or not beside.is_open:
+            self.end()
+            return estimate
+        if not verdict.has_returned:
+            # The engines beside have not seen what is believed now: they begin with it.
+            estimate = estimate or engine.step(offered["t_q_degc"], offered["at_degc"], others)
+            beside._begin_engines(engine)
+        self._go_on_with(beside)
+        return estimate
+
+    def _go_on_with(self, beside: OneJump) -> None:
+        at_zero, before = self.zero_in_use, self.state
+        self.state, self._engines, self._beside = beside.state, beside._engines, None
+        self.state.again, self.state.quiet = max(before.again, self.state.again), 0
+        self.state.last, self.state.unseen = before.last, before.unseen
+        if self._engines is not None:
+            self._engines.take_zero(at_zero)
+
+    def _begin(self, engine: Engine, phase: Phase) -> None:
+        self._begin_engines(engine)
+        self.state = self.state.begun(phase)
+
+    def _begin_engines(self, engine: Engine) -> None:
+        self._engines = JumpEngines.begin(self._setup.model, engine.snapshot())
+        self._engines.take_zero(self._at_zero)
+
+    # ------------------------------------------------------------------ the other channel
+
+    @property
+    def _beside_suspects(self) -> tuple[str, ...]:
+        return self._beside.suspects if self._beside is not None else ()
+
+    def _is_for_beside(self, name: str) -> bool:
+        """Return whether the watch beside judges a channel: the other one, while one alone is suspect."""
+        shifts = self.state.shifts_k
+        return self.state.is_suspect and len(shifts) == 1 and name not in shifts
+
+    def _judge_beside(
+        self,
+        engines: JumpEngines,
+        measured: Mapping[str, float],
+        fast: list[str],
+        fed: Fed,
+        others: Mapping[str, float],
+        grown_um: float,
+    ) -> Judgement:
+        names = [name for name in self._names if self._is_for_beside(name)]
+        if not names:
+            self._beside = None
+            return Judgement()
+        if self._beside is None:
+            self._beside = OneJump(self._setup, tuple(names))
+            self._beside.state.unseen = {name: n for name, n in self.state.unseen.items() if name in names}
+            self._beside._at_zero = engines.shifted.at_zero
+        values = {name: measured[name] if name in names else fed.values[name] for name in TEMPERATURES}
+        fast = [name for name in fast if name in names]
+        found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_um)
+        if not self._beside.is_open:
+            self._beside.count_quiet()
+        return found
+
+    # ------------------------------------------------------------------ jumps again
+
+    def _use_no_longer(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
+        """Suspect channels that jump again: what unconfirmed ones have shown is kept if nothing contradicts it."""
+        state = self.state
+        was_used = state.is_unconfirmed and state.age - state.loose > state.loose and not is_contradicted(state)
+        if was_used:
+            state.age = 0
+        else:
+            engines.give(engine, engines.shifted)
+        state.suspect(Phase.SUSPECT_AFTER_USE if was_used else Phase.SUSPECT)
+        self._believe_anew(engine, engines, offered)
+
+    def _believe_anew(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> None:
+        """Let the believing engine begin with this jump: what was wrong before it is undone."""
+        self.state.loose = self.state.age
+        if self.state.phase == Phase.SUSPECT_AFTER_USE and engines.fits(engine, self.state, offered):
+            engines.believe_from_used(engine)
+        else:
+            engines.believe_from_shifted()
+
+    def _unsettle(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> list[Note]:
+        """Account for a further jump of a loose contact."""
+        state = self.state
+        if state.is_suspect and state.samples <= 1 and engines.goes_away(state, offered):
+            # What goes on from sample to sample is one jump, or heat.
+            state.samples = 0
+            return []
+        state.at_held = 0
+        state.again += 1
+        if state.is_suspect:
+            self._believe_anew(engine, engines, offered)
+            state.start_evidence()
+            return []
+        self._use_no_longer(engine, engines, offered)
+        return [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if not math.isnan(offered[name])]
+
+    # ------------------------------------------------------------------ signs
+
+    def _unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
+        signs = self._setup.signs
+        return [n for n in signs.unexpected(engine, offered, seen_again) if n in self._names] if signs else []
+
+    def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
+        signs = self._setup.signs
+        return [name for name in signs.watchable(engine, offered) if name in self._names] if signs else []
+
+    def _going_on(self, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
+        """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
+        shifts = self.state.shifts_k
+        less = {name: value - shifts.get(name, 0.0) for name, value in offered.items()}
+        return [name for name in self._watchable(engines.shifted.engine, less) if name in shifts]
+
+    def _seen_again(self, measured: Mapping[str, float]) -> list[str]:
+        """Return the channels that are seen again after samples without them, and count such samples."""
+        unseen = self.state.unseen
+        self.state.unseen = {name: unseen.get(name, 0) + 1 for name in self._names if math.isnan(measured[name])}
+        return [name for name, samples in unseen.items() if samples >= UNSEEN_SAMPLES and name not in self.state.unseen]
+
+
+def _others(state: JumpState) -> tuple[str, ...]:
+    return tuple(name for name in TEMPERATURES if name not in state.shifts_k)
+
+
+def _moved(before: Estimate | None, now: Estimate | None) -> tuple[Estimate, Estimate] | None:
+    """Return what the compensation's engine had estimated at the last zero, before and now; None if unchanged."""
+    return (before, now) if before is not None and now is not None and now != before else None

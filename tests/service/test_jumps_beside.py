@@ -1,0 +1,218 @@
+"""A jump of one channel while the other one has jumped, and zeros while either answer may be right."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compensator.errors import DataError
+from compensator.messages import encode, number
+from compensator.service.compensation import Compensation
+from tests.service.jumping import BEGIN, CHANNELS, END, Change, events, offsets, run, settings, working_day
+from tests.service.records import QUILL, sample
+
+Steps = list[tuple[int, str, float]]
+
+
+@pytest.fixture(scope="module")
+def day() -> dict[str, np.ndarray]:
+    return working_day()
+
+
+def steps(*found: tuple[int, str, float]) -> Change:
+    """Each channel keeps the last of its steps, K; NaN is missing."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        last = {name: size for begin, name, size in found if begin <= i}
+        for name, size in last.items():
+            values[name] += size
+
+    return change
+
+
+def zero_at(sample_number: int) -> Callable[[int, Compensation], None]:
+    return lambda i, compensation: compensation.zero("warm") if i == sample_number else None
+
+
+def is_wrong_in_ok(day: dict[str, np.ndarray], outcomes: list[Any], act: Any = lambda i, c: None) -> bool:
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, act=act))) > 5.0
+    return any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
+
+
+def test_at_that_is_back_before_t_q_leaves_t_q_in_question(day: dict[str, np.ndarray]) -> None:
+    """AT comes back little by little, to where it was held; T_Q has jumped meanwhile, and stays."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if i >= BEGIN:
+            values["at_degc"] += 6.0 if i == BEGIN else max(6.0 - 0.2 * (i - BEGIN), 2.0) if i < BEGIN + 20 else 0.0
+        values["t_q_degc"] -= 4.5 if i >= BEGIN + 10 else 0.0
+
+    outcomes = run(day, change)
+    assert not is_wrong_in_ok(day, outcomes)
+    asked = {"suspect_channel:t_q_degc", "unconfirmed_channel:t_q_degc"}
+    assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 20 :])
+
+
+def test_a_loose_t_q_that_rests_does_not_end_the_question_of_at(day: dict[str, np.ndarray]) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        if BEGIN <= i < BEGIN + 40:
+            values["t_q_degc"] += 9.0 if i < BEGIN + 10 else 9.0 * (-1) ** i
+        values["at_degc"] -= 1.6 if i >= BEGIN + 2 else 0.0
+
+    outcomes = run(day, change)
+    assert "unconfirmed_channel:at_degc" in outcomes[BEGIN + 10].offset.reasons
+    asked = {"suspect_channel:at_degc", "unconfirmed_channel:at_degc"}
+    assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 10 :])
+
+
+def test_a_warm_zero_gives_t_q_another_zero_and_leaves_at_in_question(day: dict[str, np.ndarray]) -> None:
+    change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 30, "at_degc", -1.6), (END + 30, "at_degc", 0.0))
+    outcomes = run(day, change, zero_at(BEGIN + 80))
+    assert not is_wrong_in_ok(day, outcomes, zero_at(BEGIN + 80))
+    after = outcomes[BEGIN + 85 : END + 30]
+    assert all("unconfirmed_channel:at_degc" in o.offset.reasons for o in after)
+    assert not any("suspect_channel:t_q_degc" in o.offset.reasons for o in after)
+    healthy = offsets(run(day, act=zero_at(BEGIN + 80)))
+    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 45 : END + 145]) < 1.5
+
+
+@pytest.mark.parametrize("t_q", [4.5, -4.0])
+def test_what_is_refuted_beside_is_undone_in_the_compensation(day: dict[str, np.ndarray], t_q: float) -> None:
+    """T_Q beside a wrong AT looks like heat at first; once it is refuted that heat is gone."""
+    outcomes = run(day, steps((BEGIN, "at_degc", 5.0), (BEGIN + 3, "t_q_degc", t_q)))
+    suspect = next(i for i, o in enumerate(outcomes) if "suspect_channel:t_q_degc" in o.offset.reasons)
+    assert suspect <= BEGIN + 5
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    assert np.max(apart[suspect + 2 : BEGIN + 12]) < 3.0
+
+
+def test_measured_y_decides_after_a_warm_zero_as_before_it(day: dict[str, np.ndarray]) -> None:
+    outcomes = run(day, steps((BEGIN, "at_degc", -1.8)), zero_at(BEGIN + 5), y=True)
+    assert "unconfirmed_channel:at_degc" in outcomes[BEGIN + 4].offset.reasons
+    decided = events(outcomes, "jumped")[0]
+    assert decided < BEGIN + 60
+    apart = np.abs(offsets(outcomes) - offsets(run(day, act=zero_at(BEGIN + 5), y=True)))
+    assert apart[decided - 1] > 5.0 and apart[decided + 5] < 3.0
+
+
+def test_a_zero_is_what_the_compensation_estimated_also_after_a_long_gap(day: dict[str, np.ndarray]) -> None:
+    """Its engine bridges fewer samples than the two of the watch."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if BEGIN - 8 <= i < BEGIN or BEGIN + 10 <= i < BEGIN + 100:
+            values["t_q_degc"] = math.nan
+        values["t_q_degc"] += 6.0 if BEGIN <= i < END else 0.0
+
+    outcomes = run(day, change, zero_at(BEGIN + 106))
+    healthy = offsets(run(day, act=zero_at(BEGIN + 106)))
+    assert "unconfirmed_channel:t_q_degc" in outcomes[BEGIN + 106].offset.reasons
+    assert number(outcomes[BEGIN + 106].estimate.y_pred_um) == pytest.approx(0.0, abs=0.3)
+    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 20 : END + 120]) < 1.5
+
+
+DRAWN = 6
+
+
+def drawn_steps(seed: int) -> tuple[Change, Callable[[int, Compensation], None]]:
+    """Steps of both channels, gaps, zeros, pauses and resumes."""
+    rng = np.random.default_rng([seed, 10])
+    found: Steps = []
+    for name in ("t_q_degc", "at_degc"):
+        for begin in sorted(rng.integers(20, 230, size=6).tolist()):
+            found.append((begin, name, float(rng.choice([0.0, 0.0, math.nan, *rng.uniform(-9.0, 9.0, size=3)]))))
+    acts = {int(i): str(rng.choice(["warm", "warm", "pause", "resume", "rest"])) for i in rng.integers(40, 250, size=4)}
+
+    def act(i: int, compensation: Compensation) -> None:
+        match acts.get(i):
+            case "warm" | "rest" as mode:
+                compensation.zero(mode)
+            case "pause":
+                compensation.pause(3)
+            case "resume":
+                compensation.resume()
+
+    return steps(*sorted(found)), act
+
+
+@pytest.mark.parametrize("seed", range(DRAWN))
+def test_whatever_happens_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray], seed: int) -> None:
+    conf = settings()
+    whole, (change, act) = Compensation(conf, QUILL), drawn_steps(seed)
+    last = math.nan
+    for i in range(260):
+        values = {channel["name"]: float(day[channel["name"]][200 + i]) for channel in CHANNELS}
+        change(i, values)
+        if seed % 2:
+            values["y_um"] = math.nan
+        restored = Compensation(conf, QUILL)
+        restored.restore(whole.state())
+        act(i, whole)
+        act(i, restored)
+        outcome, again = whole.process(sample(i, values)), restored.process(sample(i, values))
+        assert encode(again.offset) == encode(outcome.offset) and again.notes == outcome.notes, i
+        assert restored.state() == whole.state(), i
+        offset = number(outcome.offset.y_offset_um)
+        assert not abs(offset - last) > 20.0 + 1e-9
+        last = offset
+
+
+def test_the_deviation_is_the_same_after_a_restart_while_the_second_channel_is_suspect_again(
+    day: dict[str, np.ndarray],
+) -> None:
+    change = steps(
+        (BEGIN, "at_degc", 5.0),
+        *[(BEGIN + 30 + 2 * i, "t_q_degc", k) for i, k in enumerate((-4.5, -7.0, -4.5, -8.0, -5.0, -7.5, -4.5))],
+        (BEGIN + 160, "t_q_degc", -8.0),
+    )
+
+    def restarted(i: int, compensation: Compensation) -> None:
+        if i > BEGIN:
+            compensation.restore(compensation.state())
+
+    live, again = run(day, change), run(day, change, restarted)
+    assert [encode(o.offset) for o in live] == [encode(o.offset) for o in again]
+
+
+def broken(state: bytes, path: tuple[str, ...], value: Any) -> bytes:
+    table = json.loads(state)
+    inner = table
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return json.dumps(table).encode()
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("jumps", "beside", "believing", "engine", "observer", "x"), None),
+        (("jumps", "phase"), "none"),
+        (("jumps", "beside", "shifts_k"), {"y_um": 1.0}),
+        (("memory", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
+        (("jumps", "shifted", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
+    ],
+)
+def test_a_broken_state_is_refused_and_changes_nothing(
+    day: dict[str, np.ndarray], path: tuple[str, ...], value: Any
+) -> None:
+    compensation = Compensation(settings(), QUILL)
+    change = steps((50, "t_q_degc", 8.0), (60, "at_degc", 1.6))
+    for i in range(90):
+        values = {channel["name"]: float(day[channel["name"]][200 + i]) for channel in CHANNELS} | {"y_um": math.nan}
+        change(i, values)
+        compensation.process(sample(i, values))
+    state = compensation.state()
+    if value is None:
+        value = ["inf"] * len(json.loads(state)["jumps"]["beside"]["believing"]["engine"]["observer"]["x"])
+    fresh = Compensation(settings(), QUILL)
+    before = fresh.state()
+    with pytest.raises(DataError, match=r"^state: "):
+        fresh.restore(broken(state, path, value))
+    assert fresh.state() == before
+    fresh.restore(state)
+    assert fresh.state() == state
