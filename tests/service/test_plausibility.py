@@ -19,6 +19,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.plausibility import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.state import decode_state
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from tests.service.device_faults import MINUTE_S
 from tests.service.records import QUILL, sample
 from tests.service.simulated import TABLE, config
 from tests.service.wired import WiredMachine, workshop
@@ -365,23 +366,24 @@ def wired_world() -> World:
     return World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
 
 
-async def test_wires_exchanged_at_the_start_over_the_wire(tmp_path: Path) -> None:
+def test_wires_exchanged_at_the_start_over_the_wire(tmp_path: Path) -> None:
     world = wired_world()
     swapped = {"t_q_degc": world.source("at_degc"), "at_degc": world.source("t_q_degc")}
-    with workshop() as (rack, receiver):
+    with workshop() as (shared, rack, receiver):
         machine = WiredMachine(
             rack, tmp_path, world, receiver=receiver, sources=swapped, layout="one line", plausibility=LIMITS
         )
-        await machine.run(120)
+        machine.minute_s = MINUTE_S
+        shared.run(machine.run(120))
     raised = next(o for o in machine.offsets if "t_q_at_exchanged" in o.reasons)
     assert raised.state == "fault" and machine.offsets[-1].state == "fault"
     assert machine.offsets[-1].y_offset_um == raised.y_offset_um is not None
     assert "suspects: T_Q, AT" in " ".join(event.text for event in machine.events("plausibility"))
 
 
-async def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) -> None:
+def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) -> None:
     world = wired_world()
-    with workshop() as (rack, receiver):
+    with workshop() as (shared, rack, receiver):
         machine = WiredMachine(rack, tmp_path, world, receiver=receiver, plausibility=LIMITS)
 
         def exchange(outcome: Outcome) -> None:
@@ -390,7 +392,8 @@ async def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) ->
                 sources["t_q_degc"], sources["at_degc"] = sources["at_degc"], sources["t_q_degc"]
 
         machine.after = exchange
-        await machine.run(260)
+        machine.minute_s = MINUTE_S
+        shared.run(machine.run(260))
     after = machine.offsets[150:]
     assert after[0].state == "degraded"  # neither is used from the first sample on
     assert {o.state for o in after[40:]} == {"fault"}
@@ -401,14 +404,15 @@ async def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("channel", "per_h", "within_min"), [("t_q_degc", 0.5, 100), ("t_q_degc", 1.0, 70), ("at_degc", 2.0, 60)]
 )
-async def test_a_drift_over_the_wire(tmp_path: Path, channel: str, per_h: float, within_min: int) -> None:
+def test_a_drift_over_the_wire(tmp_path: Path, channel: str, per_h: float, within_min: int) -> None:
     world = wired_world()
     straight = world.source(channel)
     begin_s = 120 * 60.0
     drifting = {channel: lambda: straight() + per_h * max(world.t_s - begin_s, 0.0) / 3600.0}
-    with workshop() as (rack, receiver):
+    with workshop() as (shared, rack, receiver):
         machine = WiredMachine(rack, tmp_path, world, receiver=receiver, sources=drifting, plausibility=LIMITS)
-        await machine.run(120 + within_min)
+        machine.minute_s = MINUTE_S
+        shared.run(machine.run(120 + within_min))
     raised = next(i for i, o in enumerate(machine.offsets) if any(r.startswith("implausible") for r in o.reasons))
     assert raised >= 120
     assert f"implausible:{channel}" in machine.offsets[raised].reasons

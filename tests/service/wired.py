@@ -43,6 +43,7 @@ from sim_hardware.wire import (
     RegisterMap,
 )
 from sim_hardware.wire.faults import Faults
+from tests.service.shared_time import SharedTime, TimedRack
 from tests.service.simulated import START_NS, TABLE, config
 
 TIMEOUT_S = 0.4
@@ -302,7 +303,8 @@ class WiredMachine:
 
 
 @contextlib.contextmanager
-def workshop() -> Iterator[tuple[Rack, Receiver]]:
-    """A place for machines: simulated devices, and a receiver."""
-    with Rack() as rack, Receiver() as receiver:
-        yield rack, receiver
+def workshop() -> Iterator[tuple[SharedTime, Rack, Receiver]]:
+    """A place for machines: simulated devices in the time of the services, and a receiver."""
+    shared = SharedTime()
+    with TimedRack(shared) as rack, Receiver() as receiver:
+        yield shared, rack, receiver
