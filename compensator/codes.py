@@ -506,7 +506,7 @@ class ModelWarning(Code):
     PATHS_KEPT = (
         "paths_kept",
         "The base model misses much of its own calibration, and its paths were kept as they are.",
-        "Calibrate it anew, or let a diagnosis fit its paths together with the effects (without --keep-paths).",
+        "Calibrate it anew, or record for longer (without --keep-paths paths are fitted together with effects).",
     )
 
 

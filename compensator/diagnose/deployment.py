@@ -59,9 +59,15 @@ class Deployment:
         return any(effect.reverses_path for effect in self.effects)
 
     @property
+    def explains_nothing(self) -> bool:
+        """Whether paths that were fitted anew are all that was found: a record alone does not show them."""
+        found = self.found
+        return not found.terms and found.remainder is None and found.refitted is not None
+
+    @property
     def is_refused(self) -> bool:
         """Whether nothing is deployed."""
-        return self.contradicted or self.reverses_path or self.worse_um is not None
+        return self.contradicted or self.reverses_path or self.worse_um is not None or self.explains_nothing
 
     @property
     def base_foretells_better(self) -> bool:

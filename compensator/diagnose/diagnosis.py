@@ -22,7 +22,7 @@ from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.deployment import deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.findings import Findings, findings_of, in_free_run
 from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.found_effect import FoundEffect, described, no_further_than_seen, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
@@ -142,7 +142,7 @@ def diagnose(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found, effects),
-        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict), *warnings),
+        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed), *warnings),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),
         ceiling=ceiling,
@@ -189,9 +189,9 @@ def _is_far_off(evidence: Evidence) -> bool:
     return own_um2 > (FAR_OFF * evidence.spread_um) ** 2
 
 
-def _paths_kept(evidence: Evidence, verdict: Verdict) -> list[Remark]:
+def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool) -> list[Remark]:
     """Return the remark that paths were kept which would be fitted anew, where something is missing."""
-    if verdict == "adequate" or evidence.free_paths or not _is_far_off(evidence):
+    if verdict == "adequate" or (evidence.free_paths and deployed) or not _is_far_off(evidence):
         return []
     text = (
         f"The calibration of the model left {evidence.model.held_out_rms_um:.1f} µm rms, much of the "
@@ -314,6 +314,9 @@ def _with_deviation(
         # small, the other has few blocks. What is open of the parameters the effects state by themselves.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
+    if not deploys and evidence.free_paths:
+        # What the base leaves is not what paths that are not deployed would.
+        left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.
     left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
     if not deploys and left <= VERDICT_TIMES**2 * model.y_std_um**2 and model.y_std_um**2 <= VERDICT_TIMES**2 * left:

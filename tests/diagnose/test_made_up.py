@@ -144,3 +144,17 @@ def test_it_is_said_why_nothing_is_deployed() -> None:
     assert remark.code == ModelWarning.WORSE_IN_FREE_RUN and "(9.40 against 0.91 µm rms)" in remark
     words = verdict(diagnosed(verdict="partly_explained", warning_codes=[str(remark.code)]))
     assert "increases the error in free run" in words and "were found" not in words
+
+
+def test_paths_fitted_anew_beside_nothing_are_not_deployed() -> None:
+    """Six hours of a machine whose T_Q lies; the gains of the two paths change their sign, and nothing has a name."""
+    case = next(c for c in _cases(300_000) if (c.family, c.seed) == ("conduction", 300_021))
+    machine = case.draw()
+    base = tc.identify(machine.calibration.columns).model
+    why = tc.diagnose(base, machine.record.columns)
+    assert why.verdict == "unexplained" and why.effects == ()
+    assert (why.model.dtf, why.model.tdtf, why.model.effects) == (base.dtf, base.tdtf, base.effects)
+    assert "paths_kept" in why.to_dict()["warning_codes"] and "fitted_anew" not in why.to_dict()["warning_codes"]
+    # It states what the base leaves of this record.
+    error = np.asarray(machine.record.columns["y_um"]) - tc.simulate(base, machine.record.columns)["y_pred_um"]
+    assert why.model.y_std_um > 0.7 * np.nanstd(error)
