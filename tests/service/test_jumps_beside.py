@@ -70,6 +70,49 @@ def test_a_loose_t_q_that_rests_does_not_end_the_question_of_at(day: dict[str, n
     assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 10 :])
 
 
+@pytest.mark.parametrize("at", [BEGIN + 15, BEGIN + 20, BEGIN + 30])
+def test_at_that_steps_while_t_q_is_loose_is_asked_about_once_t_q_is_right(day: dict[str, np.ndarray], at: int) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        values["t_q_degc"] += 8.0 if BEGIN <= i < BEGIN + 40 and ((i - BEGIN) // 2) % 2 == 0 else 0.0
+        values["at_degc"] += 1.6 if at <= i < BEGIN + 200 else 0.0
+
+    outcomes = run(day, change)
+    assert not is_wrong_in_ok(day, outcomes)
+    assert outcomes[BEGIN + 280].offset.state == "ok"
+
+
+def test_at_that_wobbles_while_it_is_pushed_in_is_no_air(day: dict[str, np.ndarray]) -> None:
+    """It is back for two samples and rests elsewhere: air goes back little by little."""
+    outcomes = run(day, steps((BEGIN, "at_degc", 4.5), (BEGIN + 10, "at_degc", 0.0), (BEGIN + 12, "at_degc", 1.7)))
+    assert not is_wrong_in_ok(day, outcomes)
+    assert not events(outcomes, "accepted")
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_a_zero_as_t_q_comes_back_gives_it_no_other_zero(day: dict[str, np.ndarray], samples: int) -> None:
+    act = zero_at(END + samples)
+    outcomes = run(day, steps((BEGIN, "t_q_degc", 8.0), (END, "t_q_degc", 0.0)), act)
+    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[END + 15 : END + 150]) < 1.0
+    assert {o.offset.state for o in outcomes[END + 15 : END + 150]} == {"ok"}
+
+
+@pytest.mark.parametrize("size", [8.0, -8.0])
+def test_a_rest_at_a_wrong_level_states_what_an_engine_without_t_q_does_not_know(
+    day: dict[str, np.ndarray], size: float
+) -> None:
+    """Both answers come to the same by chance while both are wrong."""
+    times = [(BEGIN + 60 * i + j, "t_q_degc", size * (j == 0)) for i in range(2) for j in (0, 20)]
+    outcomes = run(day, steps(*times, (BEGIN + 120, "t_q_degc", size)))
+    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    stds = np.array([number(o.offset.y_offset_std_um) for o in outcomes])
+    told = np.array(
+        [o.offset.state == "degraded" and "rate_limited" not in o.offset.reasons for o in outcomes], dtype=bool
+    )
+    told[: BEGIN + 135] = False
+    assert np.any(told)
+    assert np.all(apart[told] < 4.0 * stds[told])
+
+
 def test_a_warm_zero_gives_t_q_another_zero_and_leaves_at_in_question(day: dict[str, np.ndarray]) -> None:
     change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 30, "at_degc", -1.6), (END + 30, "at_degc", 0.0))
     outcomes = run(day, change, zero_at(BEGIN + 80))

@@ -325,8 +325,8 @@ def _move(
 ) -> _Move:
     """Find what a channel that has jumped does now; its counts are kept in the state."""
     shift = state.shifts_k[name]
-    # A heat that is switched may bring it back for a moment.
-    unsure = min(state.back.get(name, 0), BACK_SAMPLES)
+    # A heat that is switched may bring T_Q back for a moment.
+    unsure = min(state.back.get(name, 0), BACK_SAMPLES) if name == "t_q_degc" else 0
     if state.is_air:  # AT on its way back widens what is expected, not where it was
         is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
     else:
@@ -425,6 +425,11 @@ def grown(estimate: Estimate, at_zero: Estimate | None) -> list[float]:
     if at_zero is None:
         return values
     return [value - zero for value, zero in zip(values, _values(at_zero), strict=True)]
+
+
+def stds(estimate: Estimate) -> list[float]:
+    """Return the standard deviations of Y, µm, and of the further outputs in their units."""
+    return [estimate.y_std_um, *(output.std for output in estimate.outputs)]
 
 
 def _values(estimate: Estimate) -> list[float]:

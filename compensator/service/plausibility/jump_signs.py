@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from compensator.arrays import NAN
@@ -52,8 +51,6 @@ class JumpSigns:
 
     def watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that differ from what the engine expects by more than its deviation explains."""
-        if math.isnan(offered["t_q_degc"]):
-            return []
         at_degc, t_q_degc, least_k = offered["at_degc"], offered["t_q_degc"], self.least_k
         # T_Q follows AT if AT is right, and not if it is wrong: only what neither explains is a jump of T_Q.
         with_at, without = engine.forecast(at_degc), engine.forecast(NAN)

@@ -146,6 +146,10 @@ class JumpState(msgspec.Struct, kw_only=True):
         self.first_k, self.left_k = dict(self.shifts_k), {}
         self.start_counts()
 
+    def kept_k(self) -> dict[str, float]:
+        """Return by how much each channel is off now, K: what is left of its jump where it is back."""
+        return {name: self.left_k.get(name, 0.0) if self.back.get(name) else k for name, k in self.shifts_k.items()}
+
     def start_counts(self) -> None:
         """Count consecutive samples from here on."""
         self.back, self.at_held, self.moving = {}, 0, 0

@@ -177,4 +177,6 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         state.phase = Phase.AIR_RETURNED
         state.start_evidence()
         return Verdict(estimate, notes)
+    if math.isnan(offered["t_q_degc"]):
+        state.samples -= 1  # nothing but T_Q speaks for or against AT
     return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)

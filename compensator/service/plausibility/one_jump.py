@@ -22,6 +22,7 @@ from compensator.service.plausibility.jump_engines import (
     is_unsteady,
     moves,
     shifts_against,
+    stds,
 )
 from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
 from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
@@ -132,8 +133,13 @@ class OneJump:
             return self._beside.doubts(engines.shifted.estimate) if self._beside is not None else []
         if used is None or engines.shifted.estimate is None:
             return []
-        answers = grown(used, engines.zero_in_use), grown(engines.shifted.estimate, engines.shifted.at_zero)
-        return [abs(one - other) / math.sqrt(2.0) for one, other in zip(*answers, strict=True)]
+        other = engines.shifted.estimate
+        answers = zip(grown(used, engines.zero_in_use), grown(other, engines.shifted.at_zero), strict=True)
+        # Both are as likely. What the other one knows less of Y counts: it may have come to the same by chance.
+        return [
+            math.sqrt(0.5 * ((one - another) ** 2 + max(std_of_other**2 - std**2, 0.0)))
+            for (one, another), std, std_of_other in zip(answers, stds(used), stds(other), strict=True)
+        ]
 
     def snapshot(self) -> JumpState:
         """Return the state with that of its engines, and of the watch beside."""
@@ -239,7 +245,7 @@ class OneJump:
         """Give suspect channels another zero; the other one stays in question if it is."""
         names, beside, keeps = self.suspects, self._beside, self.state.phase == Phase.SUSPECT_AFTER_USE
         # What the engine has gone on from after its use stays; its estimate does, too.
-        shifts = shifts_against(engine, self.state) if keeps else dict(self.state.shifts_k)
+        shifts = shifts_against(engine, self.state) if keeps else self.state.kept_k()
         shifted = engines.shifted
         if beside is not None and beside.suspects and beside._engines is not None:
             # The watch beside takes both less their jumps.
@@ -451,7 +457,9 @@ class OneJump:
             self._beside = OneJump(self._setup, tuple(names))
             self._beside.state.unseen = {name: n for name, n in self.state.unseen.items() if name in names}
             self._beside._at_zero = engines.shifted.at_zero
-        values = {name: measured[name] if name in names else fed.values[name] for name in TEMPERATURES}
+        # What is left of a jump is a guess, by what was expected beside this very channel.
+        as_measured = {*names, *(name for name, samples in self.state.back.items() if samples)}
+        values = {name: (measured if name in as_measured else fed.values)[name] for name in TEMPERATURES}
         fast = [name for name in fast if name in names]
         found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_um)
         if not self._beside.is_open:
