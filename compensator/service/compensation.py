@@ -81,7 +81,7 @@ class Compensation(Continuity):
 
     def _release(self, *, new_zero: bool) -> None:
         """Use channels again that have jumped."""
-        found = self._jumps.release(self._engine, new_zero=new_zero)
+        found = self._jumps.release(self._engine, self._memory.estimate, new_zero=new_zero)
         self._follow(found)
         if found.estimate is not None:
             self._memory.estimate = found.estimate
@@ -226,13 +226,20 @@ class Compensation(Continuity):
         probes, self._probes = self._probes, ()
         if self.probing is None or not probes:
             return ()
-        decided, found = self.probing.decide(raw.machine, raw.seq, probes)
-        notes += found
-        if self._config.probe is not None and self._memory.estimate is not None:
+        every: list[Probe] = []
+        for received in probes:
+            before_um = self._prediction().y_um
+            decided, found = self.probing.decide(raw.machine, raw.seq, [received])
+            notes += found
+            every += decided
+            if self._config.probe is None or self._memory.estimate is None:
+                continue
+            learned_um = self._prediction().y_um - before_um
             for probe in decided:
                 std_um = probe.std_um if probe.std_um is not None else self._config.probe.std_um
-                self._jumps.receive_probe(number(probe.innovation_um), std_um, self._memory.estimate.y_um)
-        return tuple(decided)
+                innovation_um = number(probe.innovation_um)
+                self._jumps.receive_probe(innovation_um, std_um, self._memory.estimate.y_um, learned_um)
+        return tuple(every)
 
     def _evidence(self, raw: Sample, values: Values, prediction: Prediction) -> SensorEvidence:
         """Return the input of the checks between the sensors."""

@@ -197,13 +197,14 @@ class Continuity:
             raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
         if estimate is not None and len(estimate.outputs) != len(self.model.outputs):
             raise DataError(f"state: estimate of {len(estimate.outputs)} further outputs")
+        jumps = JumpWatch(self._config, self.model)
         try:
-            self._jumps.restore(restored.jumps)
+            jumps.restore(restored.jumps)
         except ValueError as error:
             raise DataError(f"state: {error}") from error
         if self.probing is not None and restored.probing is not None:
             self.probing.restore(restored.probing)
-        self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
+        self._engine, self._zero, self._memory, self._jumps = engine, restored.zero, restored.memory, jumps
         self._guards.restore(restored.guards)
         self._limiter.offset_um = restored.offset_um
         self.outputs.states = {name: (restored.axes or {})[name] for name in self.outputs.states}

@@ -541,11 +541,11 @@ def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) ->
     believing = watch.state.believing
     assert believing is not None and believing.estimate is not None
     believed = believing.estimate.y_um
-    watch.receive_probe(0.0, 1.0, believed - 60.0)  # fits neither
-    watch.receive_probe(believed, 1.0, 0.0)
+    watch.receive_probe(0.0, 1.0, believed - 60.0, 0.0)  # fits neither
+    watch.receive_probe(believed, 1.0, 0.0, 0.0)
     assert compensation.process(sample(i, values)).sample.channels["t_q_degc"].quality == "suspect"
     assert watch.suspects == ("t_q_degc",)
-    watch.receive_probe(believed, 1.0, 0.0)
+    watch.receive_probe(believed, 1.0, 0.0, 0.0)
     outcome = compensation.process(sample(i + 1, values))
     assert any(data.get("code") == "accepted" for _, _, data in outcome.notes) and watch.suspects == ()
 

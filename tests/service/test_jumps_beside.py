@@ -7,12 +7,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from compensator.config import Probe
 from compensator.errors import DataError
-from compensator.messages import encode, number
+from compensator.messages import Offset, ProbeRequest, encode, number
 from compensator.service.compensation import Compensation
+from compensator.service.probing import ReceivedProbe
 from tests.service.jumping import BEGIN, CHANNELS, END, Change, events, offsets, run, settings, working_day
 from tests.service.records import QUILL, sample
 
@@ -86,6 +89,137 @@ def test_at_that_wobbles_while_it_is_pushed_in_is_no_air(day: dict[str, np.ndarr
     outcomes = run(day, steps((BEGIN, "at_degc", 4.5), (BEGIN + 10, "at_degc", 0.0), (BEGIN + 12, "at_degc", 1.7)))
     assert not is_wrong_in_ok(day, outcomes)
     assert not events(outcomes, "accepted")
+
+
+def probed(truth_um: float, offset: Offset) -> ReceivedProbe:
+    """A probe at the last sample, without an error."""
+    applied_um = number(offset.y_offset_um)
+    request = ProbeRequest(
+        schema=1,
+        time_utc_ns=offset.time_utc_ns,
+        axis="y",
+        measured_um=truth_um + applied_um,
+        offset_applied_um=applied_um,
+    )
+    return ReceivedProbe(request=request, received_utc_ns=offset.time_utc_ns)
+
+
+def little_by_little(i: int) -> float:
+    """AT is warm air that goes, K."""
+    since = i - BEGIN
+    return 0.0 if not 0 <= since < 20 else 6.0 if since == 0 else max(6.0 - 0.2 * since, 2.0)
+
+
+@pytest.mark.parametrize("after", [21, 22, 24])
+def test_a_zero_as_air_is_gone_gives_at_no_other_zero(day: dict[str, np.ndarray], after: int) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += little_by_little(i)
+
+    act = zero_at(BEGIN + after)
+    outcomes = run(day, change, act)
+    assert not is_wrong_in_ok(day, outcomes, act)
+    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[BEGIN + 60 : BEGIN + 150]) < 2.0
+
+
+def test_a_zero_as_the_channel_beside_comes_back_gives_it_no_other_zero(day: dict[str, np.ndarray]) -> None:
+    change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 10, "at_degc", 6.0), (BEGIN + 40, "at_degc", 0.0))
+    act = zero_at(BEGIN + 41)
+    outcomes = run(day, change, act)
+    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[BEGIN + 60 : BEGIN + 150]) < 2.0
+
+
+@pytest.mark.parametrize("later", [-1, 0, 1])
+def test_a_jump_that_nobody_saw_is_asked_about_also_in_the_sample_of_another_one(
+    day: dict[str, np.ndarray], later: int
+) -> None:
+    change = steps(
+        (BEGIN - 6, "at_degc", math.nan),
+        (BEGIN, "at_degc", 2.6),
+        (BEGIN + later, "t_q_degc", 8.0),
+        (BEGIN + 60, "t_q_degc", 0.0),
+    )
+    outcomes = run(day, change)
+    assert not is_wrong_in_ok(day, outcomes)
+    asked = {"suspect_channel:at_degc", "unconfirmed_channel:at_degc"}
+    assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 2 :])
+
+
+def test_a_zero_that_waited_for_the_end_of_a_jump_counts_for_both_engines_beside(day: dict[str, np.ndarray]) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += little_by_little(i)
+        if BEGIN - 3 <= i < BEGIN + 8:
+            values["t_q_degc"] = math.nan
+        values["t_q_degc"] -= 4.5 if i >= BEGIN + 8 else 0.0
+
+    compensation = Compensation(settings(), QUILL)
+    zeros = []
+    for i in range(BEGIN + 60):
+        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS} | {"y_um": math.nan}
+        change(i, values)
+        if i == BEGIN - 2:
+            compensation.zero("warm")
+        outcome = compensation.process(sample(i, values))
+        zeros += [i for kind, *_ in outcome.notes if kind == "zero"]
+        if zeros[-1] > BEGIN and compensation._jumps.state.believing is not None:
+            state = compensation._jumps.state
+            assert state.zero_in_use is not None and state.believing.at_zero is not None
+            assert state.shifted is not None and state.shifted.at_zero is not None
+    assert zeros[-1] > BEGIN
+
+
+def test_the_level_of_y_is_forgotten_with_a_jump_that_has_seen_a_zero(day: dict[str, np.ndarray]) -> None:
+    def act(i: int, compensation: Compensation) -> None:
+        if i == BEGIN + 8:
+            compensation.zero("warm")
+        if i == BEGIN + 10:
+            compensation.resume()
+        if i == BEGIN + 12:
+            levels.append(compensation._jumps.state.level_um)
+
+    levels: list[float] = []
+    run(day, steps((BEGIN, "at_degc", -1.8)), act, y=True)
+    healthy = Compensation(settings(), QUILL)
+    for i in range(BEGIN):
+        healthy.process(sample(i, {name: float(day[name][i]) for name in ("t_q_degc", "at_degc", "y_um")}))
+    # Y − prediction, not Y: the wrong AT of ten minutes is in the prediction.
+    assert abs(levels[0] - healthy._jumps.state.level_um) < 20.0 < abs(float(day["y_um"][BEGIN + 8]))
+
+
+def test_jumps_of_one_channel_make_no_loose_contact_of_the_other(day: dict[str, np.ndarray]) -> None:
+    change = steps(
+        *[
+            (BEGIN + at, "t_q_degc", size)
+            for at, size in ((-100, 8.0), (-90, 0.0), (-70, 8.0), (-60, 0.0), (0, 8.0), (6, 0.0))
+        ],
+        (BEGIN + 1, "at_degc", math.nan),
+        (BEGIN + 4, "at_degc", -4.0),
+    )
+    outcomes = run(day, change)
+    assert not is_wrong_in_ok(day, outcomes)
+    assert not [
+        n.text for o in outcomes for n in o.notes if "AT" in n.text and "at rest" in n.text and n.kind == "plausibility"
+    ]
+
+
+@pytest.mark.parametrize("size", [1.8, -1.8])
+def test_probes_that_are_right_never_confirm_a_sensor_that_is_wrong(day: dict[str, np.ndarray], size: float) -> None:
+    """The first probes are taken into the correction, which then hides the fault from the next ones."""
+    probe = Probe(std_um=1.0, measured_max_um=200.0, largest_um=40.0, tolerance_um=3.0)
+    compensation = Compensation(msgspec.structs.replace(settings(), probe=probe), QUILL)
+    outcome, reasons = None, dict[int, list[str]]()
+    for i in range(END):
+        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+        truth_um = values["y_um"] - float(day["y_um"][0])
+        values["y_um"] = math.nan
+        values["at_degc"] += size if i >= BEGIN else 0.0
+        if outcome is not None and i in range(BEGIN + 25, BEGIN + 66, 10):
+            compensation.receive_probes([probed(truth_um, outcome.offset)])
+        outcome = compensation.process(sample(i, values))
+        reasons[i] = list(map(str, outcome.offset.reasons))
+        assert not any("confirmed: probes" in note.text for note in outcome.notes)
+    asked = {"suspect_channel:at_degc", "unconfirmed_channel:at_degc"}
+    assert all(asked & set(reasons[i]) for i in range(BEGIN + 2, END))
+    assert "suspect_channel:at_degc" in reasons[BEGIN + 50]
 
 
 @pytest.mark.parametrize("samples", [1, 2])

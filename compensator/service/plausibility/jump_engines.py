@@ -98,12 +98,15 @@ class JumpEngines:
         self.has_given = False
 
     @classmethod
-    def begin(cls, model: ThermalModel, state: EngineState) -> JumpEngines:
-        """Start both from the state of the compensation's engine."""
+    def begin(
+        cls, model: ThermalModel, state: EngineState, estimate: Estimate | None, at_zero: Estimate | None
+    ) -> JumpEngines:
+        """Start both from the compensation's engine, its last estimate and that of a zero that counts."""
         runs = (_new_run(model), _new_run(model))
         for run in runs:
             run.engine.restore(state)
-        return cls(*runs)
+            run.estimate, run.at_zero = estimate, at_zero
+        return cls(*runs, at_zero)
 
     @classmethod
     def restored(cls, model: ThermalModel, state: JumpState) -> JumpEngines | None:
@@ -119,7 +122,12 @@ class JumpEngines:
         is_open = bool(state.shifts_k)
         if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.shifts_k) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
-        if state.beside is not None and not (state.is_suspect and len(state.shifts_k) == 1):
+        if not set(state.shifts_k) == set(state.first_k) == set(state.shift_std_k):
+            raise ValueError("state of a jump whose channels differ")
+        beside = state.beside
+        if beside is not None and not (
+            state.is_suspect and len(state.shifts_k) == 1 and not set(beside.shifts_k) & set(state.shifts_k)
+        ):
             raise ValueError("state of a jump beside none")
         if believing is None or shifted is None:
             return None
@@ -357,7 +365,8 @@ def _enter_jump(state: JumpState, name: str, difference: float, std: float, *, g
     """Enter a jump, or the next step of one, in the state."""
     is_again = state.is_suspect and name in state.shifts_k
     state.steps += is_again and goes_on
-    state.again += is_again and not goes_on
+    if is_again and not goes_on:
+        state.again[name] = state.again.get(name, 0) + 1
     state.shifts_k[name], state.shift_std_k[name], state.back[name] = difference, std, 0
     if state.phase == Phase.AIR_RETURNED:
         state.phase = Phase.AIR
@@ -369,12 +378,12 @@ def _enter_jump(state: JumpState, name: str, difference: float, std: float, *, g
 
 def is_unsteady(state: JumpState) -> bool:
     """Return whether the channels that have jumped are those of a loose contact: the shifted engine goes without."""
-    return state.again >= _UNSTEADY and not state.is_air and (state.is_suspect or state.is_unconfirmed)
+    return state.most_again >= _UNSTEADY and not state.is_air and (state.is_suspect or state.is_unconfirmed)
 
 
 def needed_samples(state: JumpState) -> int:
     """Return for how many samples a suspect channel must be back, or come to rest."""
-    return min(BACK_SAMPLES << min(state.again, 8), MOST_BACK_SAMPLES)
+    return min(BACK_SAMPLES << min(state.most_again, 8), MOST_BACK_SAMPLES)
 
 
 def moves(state: JumpState, offered: Mapping[str, float], change_k: Mapping[str, float]) -> bool:
@@ -460,4 +469,6 @@ def _checked(model: ThermalModel, estimate: Estimate | None) -> Estimate | None:
     """Return an estimate of a state if it can be one of the model."""
     if estimate is not None and len(estimate.outputs) != len(model.outputs):
         raise ValueError(f"state of a jump with {len(estimate.outputs)} further outputs")
+    if estimate is not None and len(estimate.y_effects_um) != len(model.effects):
+        raise ValueError(f"state of a jump with {len(estimate.y_effects_um)} effects")
     return estimate

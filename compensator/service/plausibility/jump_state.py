@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection
 from enum import StrEnum
 
 import msgspec
@@ -56,9 +57,9 @@ class JumpState(msgspec.Struct, kw_only=True):
         The first jump of each of them, K.
     steps : int
         Further samples that these jumps have taken.
-    again : int
+    again : dict of str to int
         Jumps after the first one, also of earlier times until `FORGOTTEN_SAMPLES` have passed.
-    quiet : int
+    quiet : dict of str to int
         Samples since the last jump or return.
     phase : Phase
         What is known of these channels.
@@ -86,6 +87,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Probes that have spoken for them.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
+    learned_um : float
+        By how much probes have changed the correction since a jump, µm; of the watch as a whole.
     zero_in_use : Estimate, optional
         What the compensation's engine had estimated at a zero on a warm machine since then.
     beside : JumpState, optional
@@ -97,8 +100,8 @@ class JumpState(msgspec.Struct, kw_only=True):
     shift_std_k: dict[str, float] = {}
     first_k: dict[str, float] = {}
     steps: int = 0
-    again: int = 0
-    quiet: int = FORGOTTEN_SAMPLES
+    again: dict[str, int] = {}
+    quiet: dict[str, int] = {}
     phase: Phase = Phase.NONE
     age: int = 0
     loose: int = 0
@@ -116,6 +119,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
+    learned_um: float = 0.0
     zero_in_use: Estimate | None = None
     beside: JumpState | None = None
 
@@ -164,14 +168,28 @@ class JumpState(msgspec.Struct, kw_only=True):
         self.phase = phase
         self.start_evidence()
 
-    def begun(self, phase: Phase) -> JumpState:
-        """Return the state when a channel has jumped, or may have while it was not seen."""
-        again = self.again + (phase == Phase.SUSPECT) if self.quiet < FORGOTTEN_SAMPLES else 0
-        return JumpState(quiet=self.quiet, phase=phase, unseen=self.unseen, again=again)
+    def begun(self, phase: Phase, again: Collection[str] = ()) -> JumpState:
+        """Return the state when channels have jumped, some of them perhaps `again`, or may have while not seen."""
+        counts = {
+            name: count + (name in again)
+            for name, count in (dict.fromkeys(again, 0) | self.again).items()
+            if self.quiet.get(name, FORGOTTEN_SAMPLES) < FORGOTTEN_SAMPLES
+        }
+        return JumpState(quiet=self.quiet, phase=phase, unseen=self.unseen, again=counts)
 
     def ended(self) -> JumpState:
         """Return the state when all channels are used again."""
-        return JumpState(unseen=self.unseen, again=self.again, quiet=0 if self.is_suspect else self.quiet)
+        quiet = dict.fromkeys(self.shifts_k, 0) if self.is_suspect else {}
+        return JumpState(unseen=self.unseen, again=self.again, quiet=self.quiet | quiet)
+
+    def count_quiet(self) -> None:
+        """Count a sample without a jump under way."""
+        self.quiet = {name: n + 1 for name, n in self.quiet.items() if n + 1 < FORGOTTEN_SAMPLES}
+
+    @property
+    def most_again(self) -> int:
+        """How often the loosest of these channels has jumped after its first jump."""
+        return max((self.again.get(name, 0) for name in self.shifts_k), default=0)
 
     def without_engines(self) -> JumpState:
         """Return a copy without the states of the engines and of the watch beside."""

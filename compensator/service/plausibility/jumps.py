@@ -98,6 +98,7 @@ class JumpWatch:
         )
         self._jump = OneJump(self._setup)
         self._level_um = NAN
+        self._learned_um = 0.0
         self._estimate: Estimate | None = None
 
     def describe(self) -> str:
@@ -117,7 +118,7 @@ class JumpWatch:
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
-        """Channels that are used, and may have another zero since samples without them."""
+        """Channels that are used, and of which nothing confirms that they have kept their zero."""
         return self._jump.unconfirmed
 
     @property
@@ -133,7 +134,7 @@ class JumpWatch:
     @property
     def state(self) -> JumpState:
         """State after the last sample."""
-        return msgspec.structs.replace(self._jump.snapshot(), level_um=self._level_um)
+        return msgspec.structs.replace(self._jump.snapshot(), level_um=self._level_um, learned_um=self._learned_um)
 
     def restore(self, state: JumpState | None) -> None:
         """Continue from a state; None if it is that of a version without this watch.
@@ -145,7 +146,7 @@ class JumpWatch:
         """
         state = state or JumpState()
         self._jump = OneJump.restored(self._setup, state)
-        self._level_um, self._estimate = state.level_um, None
+        self._level_um, self._learned_um, self._estimate = state.level_um, state.learned_um, None
 
     def set_zero(self, used: Estimate | None, y_um: float) -> None:
         """Account for a zero.
@@ -160,25 +161,28 @@ class JumpWatch:
         if used is None:
             self._jump.end()
         self._jump.set_zero(used)
-        self._level_um = y_um if self._jump.is_open else NAN
+        self._level_um, self._learned_um = y_um if self._jump.is_open else NAN, 0.0
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._jump.pass_time(samples, held=held)
 
-    def release(self, engine: Engine, *, new_zero: bool) -> Judgement:
+    def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
 
         Parameters
         ----------
         engine : Engine
             Engine of the compensation; its state becomes that of one of the two engines.
+        used : Estimate, optional
+            Its last estimate.
         new_zero : bool
-            Whether the sensors have another zero from now on; otherwise their values are believed since the jump.
+            Whether the sensors have another zero from now on; otherwise, and with absolute temperatures, their values
+            are believed since the jump.
         """
-        was_suspect = bool(self.suspects)
-        found = self._jump.release(engine, new_zero=new_zero)
-        self._forget_level(was_suspect=was_suspect)
+        before = self._before()
+        found = self._jump.release(engine, used, new_zero=new_zero)
+        self._forget(*before)
         return found
 
     # ------------------------------------------------------------------ one sample
@@ -201,43 +205,54 @@ class JumpWatch:
         """
         measured = {name: _measured(channels.get(name)) for name in TEMPERATURES}
         fast = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
-        was_suspect = bool(self.suspects)
+        before = self._before()
         found = self._jump.judge(engine, measured, fast, others, y_um - self._level_um)
-        self._forget_level(was_suspect=was_suspect)
+        self._forget(*before)
         return found
 
-    def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
+    def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float, learned_um: float) -> None:
         """Compare both engines with a probe.
 
         Parameters
         ----------
         innovation_um : float
-            Probe − prediction of the compensation, µm.
+            Probe − prediction of the compensation with its correction by earlier probes, µm.
         std_um : float
             Standard deviation of the probe, µm.
         predicted_um : float
             Prediction of the compensation after the last sample, µm, without a correction.
+        learned_um : float
+            By how much this probe has changed the correction, µm. What probes correct since a jump may be the jump.
         """
+        if not self._jump.is_open:
+            return
         at_zero = self._jump.zero_in_use
-        grown_um = innovation_um + predicted_um - (at_zero.y_um if at_zero is not None else 0.0)
+        grown_um = innovation_um + self._learned_um + predicted_um - (at_zero.y_um if at_zero is not None else 0.0)
         self._jump.receive_probe(grown_um, math.hypot(std_um, self._setup.y_std_um))
+        self._learned_um += learned_um
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
         self._estimate = estimate
         if not self.is_on or self._jump.is_open:
             return
-        self._jump.count_quiet()
+        self._jump.state.count_quiet()
         if math.isnan(y_um):
             return
         residual = y_um - estimate.y_um
         known = not math.isnan(self._level_um)
         self._level_um = self._level_um + _LEVEL * (residual - self._level_um) if known else residual
 
-    def _forget_level(self, *, was_suspect: bool) -> None:
-        """Forget the level once suspect channels are used again: Y − prediction is another one then."""
-        if was_suspect and not self._jump.is_open:
-            self._level_um = NAN
+    def _before(self) -> tuple[bool, bool]:
+        """Return whether a jump is under way, and whether Y − prediction is another one once it is over."""
+        return self._jump.is_open, bool(self.suspects) or self._jump.zero_in_use is not None
+
+    def _forget(self, was_open: bool, has_changed: bool) -> None:
+        """Forget what measured Y and probes have shown since a jump, once it is over."""
+        if was_open and not self._jump.is_open:
+            self._learned_um = 0.0
+            if has_changed:
+                self._level_um = NAN
 
 
 def _quality(channel: ChannelSample | None) -> str:

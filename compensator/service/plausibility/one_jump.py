@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -26,7 +26,7 @@ from compensator.service.plausibility.jump_engines import (
 )
 from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
 from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
-from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState, Phase
+from compensator.service.plausibility.jump_state import JumpState, Phase
 from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
 
 
@@ -114,7 +114,7 @@ class OneJump:
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
-        """Channels that are used, and may have another zero since samples without them."""
+        """Channels that are used, and of which nothing confirms that they have kept their zero."""
         own = tuple(self.state.shifts_k) if self.state.is_unconfirmed else ()
         return own + (self._beside.unconfirmed if self._beside is not None else ())
 
@@ -129,17 +129,17 @@ class OneJump:
         state, engines = self.state, self._engines
         if engines is None:
             return []
-        if not (state.is_unconfirmed or state.phase == Phase.SUSPECT_AFTER_USE):
-            return self._beside.doubts(engines.shifted.estimate) if self._beside is not None else []
-        if used is None or engines.shifted.estimate is None:
-            return []
+        beside = self._beside.doubts(engines.shifted.estimate) if self._beside is not None else []
         other = engines.shifted.estimate
+        if used is None or other is None or not (state.is_unconfirmed or state.phase == Phase.SUSPECT_AFTER_USE):
+            return beside
         answers = zip(grown(used, engines.zero_in_use), grown(other, engines.shifted.at_zero), strict=True)
         # Both are as likely. What the other one knows less of Y counts: it may have come to the same by chance.
-        return [
+        own = [
             math.sqrt(0.5 * ((one - another) ** 2 + max(std_of_other**2 - std**2, 0.0)))
             for (one, another), std, std_of_other in zip(answers, stds(used), stds(other), strict=True)
         ]
+        return [math.hypot(one, another) for one, another in zip(own, beside, strict=True)] if beside else own
 
     def snapshot(self) -> JumpState:
         """Return the state with that of its engines, and of the watch beside."""
@@ -185,10 +185,6 @@ class OneJump:
         if self._beside is not None:
             self._beside.pass_time(samples, held=held)
 
-    def count_quiet(self) -> None:
-        """Count a sample without a jump under way."""
-        self.state.quiet = min(self.state.quiet + 1, FORGOTTEN_SAMPLES)
-
     def end(self) -> None:
         """Use all channels as they are."""
         self._engines = self._beside = None
@@ -208,15 +204,18 @@ class OneJump:
         if self._beside is not None:
             self._beside.receive_probe(grown_um, std_um)
 
-    def release(self, engine: Engine, *, new_zero: bool) -> Judgement:
+    def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
 
         Parameters
         ----------
         engine : Engine
             Engine of the compensation; its state becomes that of one of the two engines.
+        used : Estimate, optional
+            Its last estimate.
         new_zero : bool
-            Whether the sensors have another zero from now on; otherwise their values are believed since the jump.
+            Whether the sensors have another zero from now on; otherwise, and with absolute temperatures, their values
+            are believed since the jump.
 
         Returns
         -------
@@ -230,7 +229,7 @@ class OneJump:
         estimate: Estimate | None = None
         accepted: dict[str, float] = {}
         if state.is_suspect and new_zero:
-            accepted, estimate = self._take_as_zero(engine, engines)
+            accepted, estimate = self._take_as_zero(engine, engines, used)
         elif state.is_suspect:
             accepted = dict.fromkeys(self.suspects, NAN)
             estimate = engines.give(engine, engines.believing)
@@ -241,21 +240,28 @@ class OneJump:
             self.end()
         return Judgement(estimate, accepted=accepted, zeros=_moved(before, engines.zero_in_use))
 
-    def _take_as_zero(self, engine: Engine, engines: JumpEngines) -> tuple[dict[str, float], Estimate | None]:
+    def _take_as_zero(
+        self, engine: Engine, engines: JumpEngines, used: Estimate | None
+    ) -> tuple[dict[str, float], Estimate | None]:
         """Give suspect channels another zero; the other one stays in question if it is."""
-        names, beside, keeps = self.suspects, self._beside, self.state.phase == Phase.SUSPECT_AFTER_USE
-        # What the engine has gone on from after its use stays; its estimate does, too.
-        shifts = shifts_against(engine, self.state) if keeps else self.state.kept_k()
+        state, beside = self.state, self._beside
+        names, keeps = self.suspects, state.phase == Phase.SUSPECT_AFTER_USE or state.at_held > 0
+        if state.at_held > 0:  # what it has shown was the air, and the engine without it goes on
+            shifts = dict.fromkeys(state.shifts_k, 0.0)
+        elif keeps:  # what the engine has gone on from after its use stays; its estimate does, too
+            shifts = shifts_against(engine, state)
+        else:
+            shifts = state.kept_k()
         shifted = engines.shifted
         if beside is not None and beside.suspects and beside._engines is not None:
             # The watch beside takes both less their jumps.
-            shifts, shifted, beside = shifts | beside.state.shifts_k, beside._engines.shifted, None
+            shifts, shifted, beside = shifts | beside.state.kept_k(), beside._engines.shifted, None
         estimate = None if keeps else engines.give(engine, shifted)
         moved = shifts.get("t_q_degc", 0.0), shifts.get("at_degc", 0.0)
         engine.shift_reference(*moved)
         if beside is not None and beside.is_open:
             if keeps or beside._engines is None:
-                beside._begin_engines(engine)
+                beside._begin_again(engine, used)
             else:
                 beside._engines.shift_reference(*moved)
             self._go_on_with(beside)
@@ -297,6 +303,7 @@ class OneJump:
             name: NAN if name in self._beside_suspects or (name in fast and name not in own) else value
             for name, value in measured.items()
         }
+        unseen = self.state.unseen
         seen_again = self._seen_again(measured)
         jumped, notes = self._jumped(engine, offered, own, seen_again)
         engines = self._engines
@@ -308,7 +315,7 @@ class OneJump:
         new = [name for name in fed.jumped if was_new or name in seen_again]
         notes += self._entered(engine, engines, offered, fed, [name for name in jumped if name in fed.jumped], new)
         engines.weigh(self.state, offered, fed)
-        beside = self._judge_beside(engines, measured, fast, fed, others, grown_um)
+        beside = self._judge_beside(engines, measured, fast, fed, others, grown_um, unseen)
         offered |= dict.fromkeys(self._beside_suspects, NAN)
         engines.step(offered, fed.values | dict.fromkeys(self._beside_suspects, NAN), others, beside.estimate)
         self.state.samples += 1
@@ -344,9 +351,10 @@ class OneJump:
             if fast or moves(state, offered, self._setup.change_k):
                 notes = self._unsettle(engine, engines, offered)
         elif engines is not None and fast and not state.is_suspect:
+            notes = [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if name not in fast]
             self._use_no_longer(engine, engines, offered)
         elif fast and not state.is_suspect:
-            self._begin(engine, Phase.SUSPECT)
+            self._begin(engine, Phase.SUSPECT, fast)
         elif not state.shifts_k:
             hidden = self._unexpected(engine, offered, seen_again)
             jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
@@ -409,25 +417,27 @@ class OneJump:
         if not verdict.has_returned:
             # The engines beside have not seen what is believed now: they begin with it.
             estimate = estimate or engine.step(offered["t_q_degc"], offered["at_degc"], others)
-            beside._begin_engines(engine)
+            beside._begin_again(engine, estimate)
         self._go_on_with(beside)
         return estimate
 
     def _go_on_with(self, beside: OneJump) -> None:
         at_zero, before = self.zero_in_use, self.state
         self.state, self._engines, self._beside = beside.state, beside._engines, None
-        self.state.again, self.state.quiet = max(before.again, self.state.again), 0
+        self.state.again = before.again | self.state.again
+        self.state.quiet = before.quiet | self.state.quiet | dict.fromkeys(before.shifts_k, 0)
         self.state.last, self.state.unseen = before.last, before.unseen
         if self._engines is not None:
             self._engines.take_zero(at_zero)
 
-    def _begin(self, engine: Engine, phase: Phase) -> None:
-        self._begin_engines(engine)
-        self.state = self.state.begun(phase)
+    def _begin(self, engine: Engine, phase: Phase, again: Sequence[str] = ()) -> None:
+        self._engines = JumpEngines.begin(self._setup.model, engine.snapshot(), None, self._at_zero)
+        self.state = self.state.begun(phase, again)
 
-    def _begin_engines(self, engine: Engine) -> None:
-        self._engines = JumpEngines.begin(self._setup.model, engine.snapshot())
-        self._engines.take_zero(self._at_zero)
+    def _begin_again(self, engine: Engine, estimate: Estimate | None) -> None:
+        """Let both engines go on from another one: what is in question stays, what spoke for either does not."""
+        self._engines = JumpEngines.begin(self._setup.model, engine.snapshot(), estimate, self._at_zero)
+        self.state.start_evidence()
 
     # ------------------------------------------------------------------ the other channel
 
@@ -448,14 +458,18 @@ class OneJump:
         fed: Fed,
         others: Mapping[str, float],
         grown_um: float,
+        unseen: Mapping[str, int],
     ) -> Judgement:
+        """Judge the other channel; `unseen` counts the samples without each channel before this one."""
         names = [name for name in self._names if self._is_for_beside(name)]
         if not names:
             self._beside = None
             return Judgement()
         if self._beside is None:
             self._beside = OneJump(self._setup, tuple(names))
-            self._beside.state.unseen = {name: n for name, n in self.state.unseen.items() if name in names}
+            self._beside.state.unseen = {name: n for name, n in unseen.items() if name in names}
+            self._beside.state.again = {name: n for name, n in self.state.again.items() if name in names}
+            self._beside.state.quiet = {name: n for name, n in self.state.quiet.items() if name in names}
             self._beside._at_zero = engines.shifted.at_zero
         # What is left of a jump is a guess, by what was expected beside this very channel.
         as_measured = {*names, *(name for name, samples in self.state.back.items() if samples)}
@@ -463,7 +477,7 @@ class OneJump:
         fast = [name for name in fast if name in names]
         found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_um)
         if not self._beside.is_open:
-            self._beside.count_quiet()
+            self._beside.state.count_quiet()
         return found
 
     # ------------------------------------------------------------------ jumps again
@@ -495,7 +509,7 @@ class OneJump:
             state.samples = 0
             return []
         state.at_held = 0
-        state.again += 1
+        state.again |= {name: state.again.get(name, 0) + 1 for name in state.shifts_k}
         if state.is_suspect:
             self._believe_anew(engine, engines, offered)
             state.start_evidence()
