@@ -45,10 +45,11 @@ to rest elsewhere, one of both levels was wrong.
 
 While one channel is suspect, the other one has a watch of its own *beside*, for which the shifted engine is that of the
 compensation. What it finds wrong is undone in the compensation's engine, too. Once the suspect channel is used again,
-the watch beside goes on alone. It cannot judge AT while T_Q is a loose contact: nothing then follows AT.
+the watch beside goes on alone. AT is judged by T_Q, which follows it: while T_Q is missing it is only watched.
 
 A zero on a warm machine is not of one of both answers: each engine counts from what it predicted then, and if the
-compensation's engine is given the state of another one, its zero goes with it.
+compensation's engine is given the state of another one, its zero goes with it. What probes have corrected since a jump
+may be the jump: probes are compared as if they had not.
 
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
