@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.linuxcnc.control import NAMESPACES, ROOT, STARTS, STARVED, is_starved, why_not
+from tests.linuxcnc.several import waited
 
 REASON = why_not()
 pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(860)]
@@ -73,3 +74,10 @@ def test_only_a_starved_control_is_asked_again(
 def test_a_control_is_starved_where_its_own_task_says_so() -> None:
     assert is_starved(f"...\n{STARVED}\n") and is_starved("task: main loop took 0.977323 seconds")
     assert not is_starved("task: main loop took 0.110232 seconds")
+
+
+def test_a_component_that_had_its_turn_has_not_waited() -> None:
+    turns = [float(i // 20) for i in range(400)]
+    stands = [*turns, *[turns[-1]] * 700, *[turns[-1] + 1.0 + i for i in range(50)]]
+    assert waited(turns)[-1] == 0
+    assert waited(stands)[399 + 650] == 650 + 19 and waited(stands)[-1] == 700 + 19
