@@ -27,7 +27,7 @@ from sim_hardware.wire.outlet import Outlet
 from tests.fuzz.mutation import PIECES, mutated
 from tests.service.device_faults import make_world
 from tests.service.simulated import Bench
-from tests.service.wired import Receiver, WiredMachine
+from tests.service.wired import Receiver, WiredMachine, workshop
 
 READS = 12
 #: No read may take longer; twice the time limit is what drivers promise, the rest is for a busy machine.
@@ -105,7 +105,7 @@ async def test_any_frame_gives_a_reading_or_an_error_and_the_device_comes_back(
 
 
 async def test_the_service_on_mangled_wires_never_fails_and_never_jumps(tmp_path: Path, mangled: Mangled) -> None:
-    with Rack() as rack, Receiver() as receiver:
+    with workshop() as (rack, receiver):
         machine = WiredMachine(rack, tmp_path, make_world(), layout="dcon", receiver=receiver)
 
         def switch(outcome: Outcome) -> None:

@@ -43,7 +43,6 @@ from sim_hardware.wire import (
     RegisterMap,
 )
 from sim_hardware.wire.faults import Faults
-from tests.service.shared_time import SharedTime, TimedRack
 from tests.service.simulated import START_NS, TABLE, config
 
 TIMEOUT_S = 0.4
@@ -113,9 +112,10 @@ class WiredMachine:
         model: ThermalModel | None = None,
         receiver: Receiver | None = None,
         sources: Mapping[str, Callable[[], float]] | None = None,
+        timeout_s: float = TIMEOUT_S,
         **changes: Any,
     ) -> None:
-        self.world, self.name, self.layout = world, name, layout
+        self.world, self.name, self.layout, self.timeout_s = world, name, layout, timeout_s
         self.sources: dict[str, Callable[[], float]] = {
             channel: sources[channel] if sources and channel in sources else world.source(channel)
             for channel in ("t_q_degc", "at_degc", "y_um")
@@ -156,13 +156,13 @@ class WiredMachine:
 
     def _build(self, rack: Rack) -> None:
         t_q = IcpDas("m-7018r", ranges="K", sources={0: self.read("t_q_degc")})
-        host = {"host": "127.0.0.1", "timeout_s": TIMEOUT_S}
+        host = {"host": "127.0.0.1", "timeout_s": self.timeout_s}
         couple = {"inputs": [{"input": 0, "couple": "K"}]}
         if self.layout == "apart":
             at = IcpDas("et-7018z", ranges="T", sources={0: self.read("at_degc")})
             rtu, tcp = rack.add(ModbusRtuLine({1: t_q})), rack.add(ModbusTcpServer({1: at}))
             self.lines += [
-                {"name": "a", "protocol": "modbus-rtu", "port": str(rtu.port), "timeout_s": TIMEOUT_S},
+                {"name": "a", "protocol": "modbus-rtu", "port": str(rtu.port), "timeout_s": self.timeout_s},
                 {"name": "b", "protocol": "modbus-tcp", "tcp_port": tcp.port, **host},
             ]
             self.devices += [
@@ -179,7 +179,9 @@ class WiredMachine:
         elif self.layout == "one line":
             at = IcpDas("m-7018r", ranges="K", sources={0: self.read("at_degc")})
             line = rack.add(ModbusRtuLine({1: t_q, 2: at}))
-            self.lines.append({"name": "a", "protocol": "modbus-rtu", "port": str(line.port), "timeout_s": TIMEOUT_S})
+            self.lines.append(
+                {"name": "a", "protocol": "modbus-rtu", "port": str(line.port), "timeout_s": self.timeout_s}
+            )
             self.devices += [
                 {"name": name, "line": "a", "model": "icpdas-m7018r", "address": i, "format": "hex", **couple}
                 for i, name in ((1, "couples"), (2, "cabinet"))
@@ -213,7 +215,7 @@ class WiredMachine:
             at = IcpDas("m-7018r", ranges="K", sources={0: self.read("at_degc")})
             settings = dict.fromkeys((1, 2), DconSettings(checksum=True))
             dcon = rack.add(DconLine({1: t_q, 2: at}, settings=settings))
-            self.lines.append({"name": "a", "protocol": "dcon", "port": str(dcon.port), "timeout_s": TIMEOUT_S})
+            self.lines.append({"name": "a", "protocol": "dcon", "port": str(dcon.port), "timeout_s": self.timeout_s})
             self.devices += [
                 {"name": name, "line": "a", "model": "dcon", "address": i, "checksum": True, **couple}
                 for i, name in ((1, "couples"), (2, "cabinet"))
@@ -303,8 +305,7 @@ class WiredMachine:
 
 
 @contextlib.contextmanager
-def workshop() -> Iterator[tuple[SharedTime, Rack, Receiver]]:
-    """A place for machines: simulated devices in the time of the services, and a receiver."""
-    shared = SharedTime()
-    with TimedRack(shared) as rack, Receiver() as receiver:
-        yield shared, rack, receiver
+def workshop() -> Iterator[tuple[Rack, Receiver]]:
+    """A place for machines: simulated devices, and a receiver."""
+    with Rack() as rack, Receiver() as receiver:
+        yield rack, receiver
