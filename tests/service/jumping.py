@@ -37,6 +37,11 @@ def settings(checks: dict[str, float] | None = None, channel: Any = CHANNELS, **
     return config(channel=channel, guards=GUARDS | guards, limits=limits, plausibility=plausibility)
 
 
+def readings(day: dict[str, np.ndarray], i: int) -> dict[str, float]:
+    """What the channels read in a sample of a day."""
+    return {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+
+
 def run(
     day: dict[str, np.ndarray],
     change: Change = lambda i, v: None,
@@ -49,7 +54,7 @@ def run(
 ) -> list[Outcome]:
     compensation, outcomes = Compensation(settings(channel=channel, **guards), model), []
     for i in range(len(day["t_s"])):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+        values = readings(day, i)
         change(i, values)
         if not y:
             values["y_um"] = math.nan

@@ -29,6 +29,7 @@ from tests.service.jumping import (
     biased,
     events,
     offsets,
+    readings,
     run,
     settings,
     working_day,
@@ -384,7 +385,7 @@ def test_an_unconfirmed_channel_stays_so_over_a_restart(day: dict[str, np.ndarra
 
     through = run(day, jump)[: BEGIN + 40]
     for i in range(BEGIN + 40):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+        values = readings(day, i)
         again(i, values)
         values["y_um"] = math.nan
         if i in (BEGIN - 5, BEGIN + 1, BEGIN + 20):
@@ -533,7 +534,7 @@ def test_check_names_the_guards_and_a_head_that_cannot_be_written(
 def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) -> None:
     compensation = Compensation(settings(), QUILL)
     for i in range(BEGIN + 9):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS} | {"y_um": math.nan}
+        values = readings(day, i) | {"y_um": math.nan}
         values["t_q_degc"] += 8.0 if i >= BEGIN else 0.0
         compensation.process(sample(i, values))
     watch = compensation._jumps
@@ -692,7 +693,7 @@ def test_the_state_goes_on_to_the_bit(
         values[channel] += size if 250 <= i < 330 else left * (i >= 330)
 
     for i in range(200, 360):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+        values = readings(day, i)
         change(i, values)
         if is_beside:
             values["at_degc" if channel == "t_q_degc" else "t_q_degc"] -= 1.6 if 270 <= i < 345 else 0.0

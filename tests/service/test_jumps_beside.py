@@ -16,7 +16,7 @@ from compensator.errors import DataError
 from compensator.messages import Offset, ProbeRequest, encode, number
 from compensator.service.compensation import Compensation
 from compensator.service.probing import ReceivedProbe
-from tests.service.jumping import BEGIN, CHANNELS, END, Change, events, offsets, run, settings, working_day
+from tests.service.jumping import BEGIN, END, Change, events, offsets, readings, run, settings, working_day
 from tests.service.records import QUILL, sample
 
 Steps = list[tuple[int, str, float]]
@@ -154,7 +154,7 @@ def test_a_zero_that_waited_for_the_end_of_a_jump_counts_for_both_engines_beside
     compensation = Compensation(settings(), QUILL)
     zeros = []
     for i in range(BEGIN + 60):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS} | {"y_um": math.nan}
+        values = readings(day, i) | {"y_um": math.nan}
         change(i, values)
         if i == BEGIN - 2:
             compensation.zero("warm")
@@ -208,7 +208,7 @@ def test_probes_that_are_right_never_confirm_a_sensor_that_is_wrong(day: dict[st
     compensation = Compensation(msgspec.structs.replace(settings(), probe=probe), QUILL)
     outcome, reasons = None, dict[int, list[str]]()
     for i in range(END):
-        values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
+        values = readings(day, i)
         truth_um = values["y_um"] - float(day["y_um"][0])
         values["y_um"] = math.nan
         values["at_degc"] += size if i >= BEGIN else 0.0
@@ -322,7 +322,7 @@ def test_whatever_happens_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray
     whole, (change, act) = Compensation(conf, QUILL), drawn_steps(seed)
     last = math.nan
     for i in range(260):
-        values = {channel["name"]: float(day[channel["name"]][200 + i]) for channel in CHANNELS}
+        values = readings(day, 200 + i)
         change(i, values)
         if seed % 2:
             values["y_um"] = math.nan
@@ -380,7 +380,7 @@ def test_a_broken_state_is_refused_and_changes_nothing(
     compensation = Compensation(settings(), QUILL)
     change = steps((50, "t_q_degc", 8.0), (60, "at_degc", 1.6))
     for i in range(90):
-        values = {channel["name"]: float(day[channel["name"]][200 + i]) for channel in CHANNELS} | {"y_um": math.nan}
+        values = readings(day, 200 + i) | {"y_um": math.nan}
         change(i, values)
         compensation.process(sample(i, values))
     state = compensation.state()

@@ -180,6 +180,11 @@ class JumpWatch:
         new_zero : bool
             Whether the sensors have another zero from now on; otherwise, and with absolute temperatures, their values
             are believed since the jump.
+
+        Returns
+        -------
+        Judgement
+            The channels, whose values are not known, and the estimate of the new state.
         """
         before = self._before()
         found = self._jump.release(engine, used, new_zero=new_zero)

@@ -205,23 +205,7 @@ class OneJump:
             self._beside.receive_probe(grown_um, std_um)
 
     def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
-        """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
-
-        Parameters
-        ----------
-        engine : Engine
-            Engine of the compensation; its state becomes that of one of the two engines.
-        used : Estimate, optional
-            Its last estimate.
-        new_zero : bool
-            Whether the sensors have another zero from now on; otherwise, and with absolute temperatures, their values
-            are believed since the jump.
-
-        Returns
-        -------
-        Judgement
-            The channels, whose values are not known, and the estimate of the new state.
-        """
+        """Use suspect channels again because an operator says so, see `JumpWatch.release`."""
         engines, state, before = self._engines, self.state, self.zero_in_use
         if engines is None:
             return Judgement()
@@ -475,17 +459,18 @@ class OneJump:
         as_measured = {*names, *(name for name, samples in self.state.back.items() if samples)}
         values = {name: (measured if name in as_measured else fed.values)[name] for name in TEMPERATURES}
         fast = [name for name in fast if name in names]
-        signs = self._setup.signs
-        if not (fast or self._beside.is_open or signs is None):
-            # Where the first channel was right, what the other one does may follow from it.
-            explained = not set(signs.watchable(engines.believing.engine, measured)) & set(names)
-            if explained and names == ["t_q_degc"]:
-                self._beside._seen_again(values)
-                return Judgement()
+        if names == ["t_q_degc"] and not fast and not self._beside.is_open and self._is_expected(engines, measured):
+            self._beside._seen_again(values)
+            return Judgement()
         found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_um)
         if not self._beside.is_open:
             self._beside.state.count_quiet()
         return found
+
+    def _is_expected(self, engines: JumpEngines, measured: Mapping[str, float]) -> bool:
+        """Return whether T_Q follows from AT if that was right: then it has not jumped beside it."""
+        signs = self._setup.signs
+        return signs is not None and "t_q_degc" not in signs.watchable(engines.believing.engine, measured)
 
     # ------------------------------------------------------------------ jumps again
 
