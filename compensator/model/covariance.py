@@ -16,7 +16,8 @@ found is never changed; two threads that find the same step at once find the sam
 of steps, of all designs together. One that does not fit any more makes it forget all and begin again: until then a step
 is kept, whether or not its observer still is. Some 1,000 samples lead from rest to the steady state, as many after a
 gap: a step each. A settled observer adds none. 8 MB are 2,800 steps of `quill`, 1,470 of a machine of five parts. The
-way of a late T_Q from its past to the present (`run_on`) is one shared step, however many samples it has.
+way of a late T_Q from its past to the present (`run_on`) is one shared step, however many samples it has; it is taken
+only where somebody asks for the covariance.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
 """
@@ -105,41 +106,24 @@ class _Step(NamedTuple):
     expected: _Expected
 
 
-class _Run(NamedTuple):
-    """Steps without T_Q one after the other: the last of them, and the gain of AT in each."""
-
-    last: _Step
-    gains: list[list[float]]
-
-
 class _SharedSteps:
     """The steps that a process keeps, and how much memory they take at most."""
 
     def __init__(self) -> None:
         self.steps: dict[tuple[object, ...], _Step] = {}
-        self.runs: dict[tuple[object, ...], _Run] = {}
         self.bytes = 0
 
     def add(self, key: tuple[object, ...], step: _Step) -> None:
         """Keep a step, and forget all others where there is no room for it."""
-        self._make_room(_bytes_of(step))
-        self.steps[key] = step
-
-    def add_run(self, key: tuple[object, ...], run: _Run) -> None:
-        """Keep the steps from the past of a late T_Q to the present (as `add`)."""
-        # A list of gains is 56 bytes, each of them 32.
-        self._make_room(_bytes_of(run.last) + len(run.gains) * (32 * len(run.last.p) + 100))
-        self.runs[key] = run
-
-    def _make_room(self, size: int) -> None:
+        size = _bytes_of(step)
         if self.bytes + size > _KEPT_BYTES:
             self.clear()
         self.bytes += size
+        self.steps[key] = step
 
     def clear(self) -> None:
         """Forget all."""
         self.steps.clear()
-        self.runs.clear()
         self.bytes = 0
 
 
@@ -165,8 +149,6 @@ class Covariance:
         Whether there was a sample since it was at rest, from which on a sample moves it; the observer says so.
     settled : bool
         Whether it has reached its steady value.
-    y_var : float
-        Variance of y that sensor noise and missing samples cause, µm².
     """
 
     def __init__(self, design: Design) -> None:
@@ -188,15 +170,37 @@ class Covariance:
     def reset(self) -> None:
         """Return to rest: every state known."""
         self._set(_read_only(np.zeros((self.size, self.size))), _Expected())
-        self.y_var = 0.0
+        self._y_var = 0.0
         self.started = self.settled = False
         self._steady = Gains([], [])
 
     def _set(self, p: Matrix, expected: _Expected) -> None:
-        self.p = p
-        self._expected = expected
+        self._p = p
+        self._of_next = expected
         self._moved_p: Matrix | None = None
         self._with_at: tuple[list[float], Matrix] | None = None
+        #: Samples without T_Q that the covariance is still behind (`run_on`).
+        self._behind: tuple[float | None, ...] = ()
+
+    @property
+    def p(self) -> Matrix:
+        """The covariance, of shape (n, n)."""
+        if self._behind:
+            self._catch_up()
+        return self._p
+
+    @property
+    def y_var(self) -> float:
+        """Variance of y that sensor noise and missing samples cause, µm²."""
+        if self._behind:
+            self._catch_up()
+        return self._y_var
+
+    @property
+    def _expected(self) -> _Expected:
+        if self._behind:
+            self._catch_up()
+        return self._of_next
 
     def variances_of(self, sums: Iterable[Terms]) -> list[float]:
         """Return the variances of sums of states."""
@@ -226,7 +230,7 @@ class Covariance:
             _shared.add(key, step)
         # After the first sample it is for the observer to say whether the next one moves it.
         self._set(step.p, step.expected if self.started else _Expected())
-        self.y_var, self.settled = step.y_var, step.settled
+        self._y_var, self.settled = step.y_var, step.settled
         if self.settled:
             self._steady = self._steady_gains()
         return step.gains
@@ -348,24 +352,46 @@ class Covariance:
         list of list of float, length n
             Gains of AT in each sample; empty where it is missing.
         """
-        key = (self._key, past.p.base, past.started, extras_at_k2)
-        run = _shared.runs.get(key)
-        if run is None:
-            run = self._computed_run(past, extras_at_k2)
-            _shared.add_run(key, run)
-        self._set(run.last.p, run.last.expected if past.started else _Expected())
-        self.started, self.settled, self.y_var = past.started, False, run.last.y_var
-        return run.gains
+        p, self.started, self.settled = past.p, past.started, False
+        self._set(p, _Expected())
+        self._behind = extras_at_k2
+        return self._gains_without_t_q(p[:, self._ambient].tolist(), extras_at_k2)
 
-    def _computed_run(self, past: Covariance, extras_at_k2: tuple[float | None, ...]) -> _Run:
-        self._set(past.p, _Expected())
-        self.started = past.started
-        gains = []
+    def _gains_without_t_q(self, column: list[float], extras_at_k2: tuple[float | None, ...]) -> list[list[float]]:
+        """Return the gains of AT in each sample, with the bits of `_computed`.
+
+        They follow from the covariance of the states with the ambient, and that from itself: the ambient follows from
+        no other state.
+        """
+        a, walk, gains = self._ambient, float(self._walk[-1]), list[list[float]]()
         for extra in extras_at_k2:
-            step = self._computed(None if extra is None else self._design.at_var_k2 + extra, None, complete=False)
-            self._set(step.p, _Expected())
-            gains.append(step.gains.at)
-        return _Run(step, gains)
+            if self.started:
+                column.append(0.0)
+                column = [column[n] - k * column[f] + b * column[s] for n, f, s, k, b in self._design.rows]
+                column[a] += walk
+            if extra is None:
+                gains.append([])
+                continue
+            s_at = column[a] + (self._design.at_var_k2 + extra)
+            gain = [c / s_at for c in column] if self._design.kalman else [0.0] * a + [1.0]
+            of_a, own = gain[a], column[a]
+            column = [c - (k * own + of_a * c) + s_at * (k * of_a) for c, k in zip(column, gain, strict=True)]
+            gains.append(gain)
+        return gains
+
+    def _catch_up(self) -> None:
+        """Take the samples that the covariance is behind."""
+        extras_at_k2, self._behind = self._behind, ()
+        key = (self._key, self._p.base, self.started, extras_at_k2)
+        step = _shared.steps.get(key)
+        if step is None:
+            for extra in extras_at_k2:
+                step = self._computed(None if extra is None else self._design.at_var_k2 + extra, None, complete=False)
+                self._set(step.p, _Expected())
+            assert step is not None
+            _shared.add(key, step)
+        self._set(step.p, step.expected if self.started else _Expected())
+        self._y_var = step.y_var
 
     def widen(self, ahead: Matrix) -> None:
         """Take the optimal filter's covariance after a sample, if the variance of y is larger with it.
@@ -383,7 +409,7 @@ class Covariance:
         y_var = _variance(self._of_y, p.tolist())
         if y_var > self.y_var:
             self._set(_read_only(p), _Expected())
-            self.y_var, self.settled = y_var, False
+            self._y_var, self.settled = y_var, False
 
     def upper_triangle(self) -> tuple[float, ...]:
         """Return the upper triangle, row by row, which is all that there is: it is symmetric to the bit."""
@@ -404,7 +430,7 @@ class Covariance:
         flat[self._upper] = flat[self._lower] = upper_triangle
         self._set(_read_only(p), _Expected())
         self.started, self.settled = started, settled
-        self.y_var = _variance(self._of_y, self.p.tolist())
+        self._y_var = _variance(self._of_y, self.p.tolist())
         if settled:
             self._steady = self._steady_gains()
 

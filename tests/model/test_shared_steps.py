@@ -108,14 +108,33 @@ def test_the_way_to_the_present_is_one_step(method: str) -> None:
     for observer in observers:
         for i in range(steps):
             observer.step(0.1, math.nan if i == 20 else 0.1)
-    assert 0 < len(covariance._shared.runs) <= steps
-    assert len(covariance._shared.steps) <= steps, "those between are not kept"
+    assert len(covariance._shared.steps) <= steps, "nobody has asked for the covariance of the present"
+    for observer in observers:
+        assert observer.y_variance_um2 > 0.0
+    assert len(covariance._shared.steps) <= steps + 1, "the samples between are not kept"
     assert repr(observers[0].snapshot()) == repr(observers[1].snapshot())
     assert observers[0].y_variance_um2 == observers[1].y_variance_um2
     fresh = observer_of(model)
     for _ in range(steps):
         fresh.step(0.1, 0.1)
     assert fresh.y_variance_um2 < observers[0].y_variance_um2, "AT that was missing is another way"
+
+
+@pytest.mark.parametrize("method", ["kalman", "inverse"])
+def test_the_gains_on_the_way_are_those_of_the_covariance(method: str) -> None:
+    """To the bit: they are found without it, and an audit on the other way finds them with it."""
+    observer = Observer(late(with_method(method)))
+    here, there = observer._covariance, Observer(late(with_method(method)))._covariance
+    for i in range(70):
+        observer.step(0.1 * i, 0.1)
+        extras = (0.0, None, 0.02, 0.0)
+        gains = there.run_on(here, extras)
+        there._set(here.p, covariance._Expected())
+        for extra, gain in zip(extras, gains, strict=True):
+            variance = None if extra is None else there._design.at_var_k2 + extra
+            step = there._computed(variance, None, complete=False)
+            there._set(step.p, covariance._Expected())
+            assert repr(gain) == repr(step.gains.at)
 
 
 def test_a_step_takes_no_more_memory_than_is_counted() -> None:
