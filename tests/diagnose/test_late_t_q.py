@@ -89,7 +89,7 @@ def test_what_a_dead_time_hides_another_channel_shows() -> None:
         noise_w = np.random.default_rng(seed).normal(0.0, 2.0, true.size)
         return kept | {"motor_w": 4.0 * signals(seed, hours)[2] + noise_w}, true
 
-    found = diagnose(QUILL, runs_from(with_power(1106, 36.0)[0]))
+    found = diagnose(QUILL, runs_from(with_power(1106, 24.0)[0]))
     [effect] = found.effects
     assert effect.place == PLACE
     assert found.remainder is not None and found.remainder.deployed and found.remainder.channels == ("motor_w",)
@@ -114,7 +114,7 @@ def direct_run(seed: int, hours: float, delay_min: float) -> tuple[Run, np.ndarr
 def test_how_the_drive_goes_on_is_learned_with_a_late_t_q() -> None:
     """T_Q − AT of a direct model does not stay where it is: what a dead time hides of it is foreseen in part."""
     base = direct("kalman")
-    [effect] = diagnose(base, [direct_run(1108, 36.0, 10.0)[0]]).effects
+    [effect] = diagnose(base, [direct_run(1108, 24.0, 10.0)[0]]).effects
     late = effect.effect
     assert isinstance(late, DelayedSensor) and late.behind_min > 1.0
     stays = dataclasses.replace(late, walk_times=1.0, behind_min=0.0)
@@ -127,7 +127,7 @@ def test_how_the_drive_goes_on_is_learned_with_a_late_t_q() -> None:
 def test_how_fast_the_heat_moves_is_learned_with_a_late_t_q() -> None:
     """A calibration with hardly a change of the heat says that it hardly moves, and the correction comes late."""
     calm = dataclasses.replace(QUILL, estimator=dataclasses.replace(QUILL.estimator, drive_walk_std=0.5))
-    columns, _, _ = record([sensor(0.0, 2.0)], 1109, 36.0)
+    columns, _, _ = record([sensor(0.0, 2.0)], 1109, 24.0)
     [effect] = diagnose(calm, runs_from(columns)).effects
     late = effect.effect
     assert isinstance(late, DelayedSensor) and late.walk_times > 2.0 and late.behind_min == 0.0
@@ -153,7 +153,7 @@ def test_no_dead_time_is_none() -> None:
 def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
     late = sensor(0.0, 3.0)
     weaker = Scenario(place=("gain", "DTF", ""), act=lambda s: -0.2 * s[4])
-    columns, _, _ = record([late, weaker], 1101, 36.0)
+    columns, _, _ = record([late, weaker], 1101, 24.0)
     found = diagnose(QUILL, runs_from(columns))
     assert sorted(e.place for e in found.effects) == [PLACE, ("gain", "DTF", "")]
     gain = next(e for e in found.effects if e.kind == "gain")
@@ -211,7 +211,7 @@ def test_a_late_thermocouple_of_another_hand() -> None:
 
 
 def test_a_thermocouple_that_is_late_for_the_ambient_too() -> None:
-    t_q, at, y = run_of(1104, 36.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    t_q, at, y = run_of(1104, 24.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
     noise = np.random.default_rng(2).normal(0.0, 0.3, y.size)
     found = diagnose(QUILL, runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise}))
     assert [e.place for e in found.effects] == [PLACE]
@@ -223,8 +223,8 @@ def test_a_thermocouple_that_is_late_for_the_ambient_too() -> None:
 
 def test_a_direct_model_names_its_sensor() -> None:
     late, base = sensor(4.0, 0.0), direct("kalman")
-    columns, _, _ = record([late], 1103, 36.0)
-    _, _, _, _, _, y_tdtf, difference = signals(1103, 36.0)
+    columns, _, _ = record([late], 1103, 24.0)
+    _, _, _, _, _, y_tdtf, difference = signals(1103, 24.0)
     y = base.dtf.sampled.response(difference) + y_tdtf
     columns["y_um"] = y + np.random.default_rng(1).normal(0.0, 0.1, y.size)
     found = diagnose(base, runs_from(columns))
