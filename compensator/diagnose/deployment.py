@@ -89,6 +89,7 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
     """
     found, effects, held_out = _with_remainder_that_helps(found, effects, held_out)
     found, effects, held_out = _by_channels(found, effects, held_out)
+    found, held_out = _by_names_alone(found, held_out)
     decided = Deployment(
         found=found,
         effects=effects,
@@ -172,6 +173,19 @@ def _by_channels(
         return found, effects, held_out
     effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
+
+
+def _by_names_alone(found: Findings, held_out: HeldOut) -> tuple[Findings, HeldOut]:
+    """Deploy names without a remainder where held-out blocks contradict only what else searches without a block named.
+
+    Which name a part of the data gets is less certain than what the effect does: a fan that schedules a path is an
+    input in one of three parts. The other name is not deployed, and says nothing of the one that is.
+    """
+    alone = dataclasses.replace(held_out, named=held_out.places, whole=held_out.places)
+    judged = found.terms and found.explains and not found.search.evidence.free_paths
+    if not judged or not _is_contradicted(found, held_out) or _is_contradicted(found, alone):
+        return found, held_out
+    return dataclasses.replace(found, remainder=None, belongs=False), alone
 
 
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:

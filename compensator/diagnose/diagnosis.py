@@ -398,7 +398,7 @@ def _verdict(
         most_um2 = min(most_um2, VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count))
 
     def holds(values: Vector) -> bool:
-        return rms_of(values) ** 2 <= most_um2
+        return rms_of(values) ** 2 < most_um2
 
     nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains and holds_in_free_run
     by_names = leaves_noise(found.named) and holds(held_out.named) and all(e.is_determined for e in effects)

@@ -242,7 +242,9 @@ def warnings_of(
         )
         warnings.append(Remark(ModelWarning.WORSE_IN_FREE_RUN, text))
     # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
-    elif any(effect.effect.observed for effect in effects) and rms_after > rms_before:
+    elif any(effect.effect.observed for effect in effects) and (
+        rms_after > rms_before or (deployed and rms_after == rms_before)
+    ):
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
             text = f"The effects are clear in all data together, but do not predict held-out blocks better {numbers}."

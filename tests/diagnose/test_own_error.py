@@ -106,7 +106,9 @@ def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(helps, share):
     noise = random.normal(0.0, 1.0, own.size)
     noise -= own * (noise @ own) / (own @ own)
     named = helps * own + noise
-    held_out = HeldOut(base=named, nothing=9.0 * noise, named=named, whole=named - own, ceiling=9.0 * noise, steps=())
+    held_out = HeldOut(
+        base=named, nothing=9.0 * noise, named=named, whole=named - own, ceiling=9.0 * noise, places=named, steps=()
+    )
     chosen, _, judged = _as_far_as_confirmed(found, (), held_out)
     np.testing.assert_allclose(judged.whole, noise + (helps - share) * own, atol=1e-9)
     np.testing.assert_allclose(chosen.whole, found.named + share * found.remainder.added, atol=1e-9)
@@ -158,7 +160,13 @@ def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_i
     assert found.is_own_error_alone and found.terms and not found.explains
     nothing = found.search.evidence.residual
     held_out = HeldOut(
-        base=nothing, nothing=nothing, named=0.5 * nothing, whole=1.5 * nothing, ceiling=2.0 * nothing, steps=()
+        base=nothing,
+        nothing=nothing,
+        named=0.5 * nothing,
+        places=0.5 * nothing,
+        whole=1.5 * nothing,
+        ceiling=2.0 * nothing,
+        steps=(),
     )
     chosen = deployment_of(found, (), held_out)
     assert chosen.found.terms == () and chosen.found.remainder is None and chosen.effects == ()

@@ -123,7 +123,13 @@ def test_a_remainder_that_increases_the_held_out_error_says_so_and_why_it_is_dep
 def test_no_error_is_below_the_ceiling(named: float, whole: float, best: float) -> None:
     one = np.ones(9)
     held_out = HeldOut(
-        base=9.0 * one, nothing=9.0 * one, named=named * one, whole=whole * one, ceiling=4.82 * one, steps=()
+        base=9.0 * one,
+        nothing=9.0 * one,
+        named=named * one,
+        places=named * one,
+        whole=whole * one,
+        ceiling=4.82 * one,
+        steps=(),
     )
     top = _ceiling(held_out)
     assert top is not None and top.rms_um == pytest.approx(4.82) and top.least_um == pytest.approx(best)
