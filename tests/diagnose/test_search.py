@@ -186,7 +186,8 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
 
     def worse(*arguments):
         errors = held_out(*arguments)
-        return dataclasses.replace(errors, named=times * errors.nothing, whole=times * errors.nothing)
+        wrong = times * errors.nothing
+        return dataclasses.replace(errors, named=wrong, places=wrong, whole=wrong)
 
     times = 1.1
 
