@@ -228,12 +228,16 @@ class Covariance:
         if step is None:
             step = self._computed(r_at, r_tq, complete=complete)
             _shared.add(key, step)
-        # After the first sample it is for the observer to say whether the next one moves it.
-        self._set(step.p, step.expected if self.started else _Expected())
-        self._y_var, self.settled = step.y_var, step.settled
+        self._take(step)
+        self.settled = step.settled
         if self.settled:
             self._steady = self._steady_gains()
         return step.gains
+
+    def _take(self, step: _Step) -> None:
+        # After the first sample it is for the observer to say whether the next one moves it.
+        self._set(step.p, step.expected if self.started else _Expected())
+        self._y_var = step.y_var
 
     def _computed(self, r_at: float | None, r_tq: float | None, *, complete: bool) -> _Step:
         p = self.ahead()
@@ -390,8 +394,7 @@ class Covariance:
                 self._set(step.p, _Expected())
             assert step is not None
             _shared.add(key, step)
-        self._set(step.p, step.expected if self.started else _Expected())
-        self._y_var = step.y_var
+        self._take(step)
 
     def widen(self, ahead: Matrix) -> None:
         """Take the optimal filter's covariance after a sample, if the variance of y is larger with it.

@@ -16,10 +16,10 @@ from compensator.diagnose import findings as module
 from compensator.diagnose.deployment import _by_channels, _by_names_alone
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
-from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.summary import verdict
 from sim_hardware.drawn_machines.cases import _cases
+from tests.diagnose.scenarios import held_out_errors
 from tests.diagnose.test_standing import found as diagnosed
 
 HEAT, SOURCE = np.sin(np.arange(400) / 30.0), np.sin(np.arange(400) / 11.0)
@@ -130,9 +130,7 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
 ) -> None:
     ones = np.ones(called_late.ceiling.size)
     named = named_um * ones
-    held_out = HeldOut(
-        base=ones, nothing=ones, named=named, whole=named, ceiling=channels_um * ones, places=named, steps=()
-    )
+    held_out = held_out_errors(ones, named=named, whole=named, ceiling=channels_um * ones)
     # Where an own error beside the names was confirmed in part, all of the channels are deployed.
     called_late = dataclasses.replace(called_late, confirmed=0.4)
     found, _, judged = _by_channels(called_late, (), held_out)
@@ -149,9 +147,7 @@ def test_what_other_searches_name_does_not_speak_against_a_name(
 ) -> None:
     ones = np.ones(called_late.ceiling.size)
     whole = whole_um * ones
-    held_out = HeldOut(
-        base=ones, nothing=ones, named=whole, places=places_um * ones, whole=whole, ceiling=ones, steps=()
-    )
+    held_out = held_out_errors(ones, named=whole, places=places_um * ones, whole=whole, ceiling=ones)
     beside = dataclasses.replace(called_late, remainder=called_late.channels, explains=True)
     found, judged = _by_names_alone(beside, held_out)
     assert (found.remainder is None) is is_alone and found.terms == called_late.terms

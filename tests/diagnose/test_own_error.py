@@ -12,7 +12,6 @@ from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
-from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.points import Points
@@ -20,7 +19,7 @@ from compensator.diagnose.search import Search
 from compensator.diagnose.summary import figures
 from compensator.model.model_file import load_model
 from sim_hardware.drawn_machines.cases import _cases
-from tests.diagnose.scenarios import draw, record
+from tests.diagnose.scenarios import draw, held_out_errors, record
 from tests.identify.quill_runs import runs_from
 
 #: As `identify` states it: a base whose paths miss 0.6 µm.
@@ -106,9 +105,7 @@ def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(helps, share):
     noise = random.normal(0.0, 1.0, own.size)
     noise -= own * (noise @ own) / (own @ own)
     named = helps * own + noise
-    held_out = HeldOut(
-        base=named, nothing=9.0 * noise, named=named, whole=named - own, ceiling=9.0 * noise, places=named, steps=()
-    )
+    held_out = held_out_errors(9.0 * noise, named=named, whole=named - own, ceiling=9.0 * noise)
     chosen, _, judged = _as_far_as_confirmed(found, (), held_out)
     np.testing.assert_allclose(judged.whole, noise + (helps - share) * own, atol=1e-9)
     np.testing.assert_allclose(chosen.whole, found.named + share * found.remainder.added, atol=1e-9)
@@ -159,15 +156,7 @@ def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_i
     found = findings_of(evidence_of(base, runs))
     assert found.is_own_error_alone and found.terms and not found.explains
     nothing = found.search.evidence.residual
-    held_out = HeldOut(
-        base=nothing,
-        nothing=nothing,
-        named=0.5 * nothing,
-        places=0.5 * nothing,
-        whole=1.5 * nothing,
-        ceiling=2.0 * nothing,
-        steps=(),
-    )
+    held_out = held_out_errors(nothing, named=0.5 * nothing, whole=1.5 * nothing, ceiling=2.0 * nothing)
     chosen = deployment_of(found, (), held_out)
     assert chosen.found.terms == () and chosen.found.remainder is None and chosen.effects == ()
     np.testing.assert_array_equal(chosen.held_out.whole, nothing)

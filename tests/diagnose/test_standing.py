@@ -11,10 +11,10 @@ import pytest
 from compensator.diagnose.ceiling import ceiling, remainder
 from compensator.diagnose.diagnosis import _ceiling
 from compensator.diagnose.found_effect import FoundEffect, rivals_of
-from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import headline
 from compensator.report.diagnosis import tone_of
+from tests.diagnose.scenarios import held_out_errors
 
 #: Errors of two gains that are known only together.
 FAR = {"gain 1": 30.0, "gain 2": 30.0}
@@ -122,15 +122,7 @@ def test_a_remainder_that_increases_the_held_out_error_says_so_and_why_it_is_dep
 @pytest.mark.parametrize(("named", "whole", "best"), [(4.7, 6.37, 4.7), (5.49, 4.18, 4.18), (7.0, 7.0, 4.82)])
 def test_no_error_is_below_the_ceiling(named: float, whole: float, best: float) -> None:
     one = np.ones(9)
-    held_out = HeldOut(
-        base=9.0 * one,
-        nothing=9.0 * one,
-        named=named * one,
-        places=named * one,
-        whole=whole * one,
-        ceiling=4.82 * one,
-        steps=(),
-    )
+    held_out = held_out_errors(9.0 * one, named=named * one, whole=whole * one, ceiling=4.82 * one)
     top = _ceiling(held_out)
     assert top is not None and top.rms_um == pytest.approx(4.82) and top.least_um == pytest.approx(best)
     assert top.explained_pct == pytest.approx(min(100.0 * (81.0 - named**2) / (81.0 - 4.82**2), 100.0))
