@@ -20,6 +20,7 @@ from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import write_table
 from compensator.errors import ServiceError
 from tests.audit.made import START_NS, Service
+from tests.cli.jobs import job
 from tests.diagnose.scenarios import draw, record
 from tests.shared_folder import search_once
 
@@ -124,21 +125,15 @@ def test_a_cluster_that_is_not_there_is_said_in_one_line(
     assert words in capsys.readouterr().err
 
 
-def _job(number: int, refused: bool = False) -> tuple[int, int]:
-    if refused:
-        raise ServiceError(f"job {number} cannot be done")
-    return number, os.getpid()
-
-
 @pytest.mark.parametrize("cores", [1, 2])
 def test_independent_jobs_give_their_results_in_order_in_processes_of_their_own(
     cores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     told: list[tuple[int, int]] = []
-    results = in_parallel([partial(_job, i) for i in range(3)], lambda done, total: told.append((done, total)))
+    results = in_parallel([partial(job, i) for i in range(3)], lambda done, total: told.append((done, total)))
     assert [number for number, _ in results] == [0, 1, 2]
     assert {pid == os.getpid() for _, pid in results} == {cores == 1}
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     with pytest.raises(ServiceError, match="job 1 cannot be done"):
-        in_parallel([partial(_job, i, refused=i == 1) for i in range(3)], lambda done, total: None)
+        in_parallel([partial(job, i, refused=i == 1) for i in range(3)], lambda done, total: None)
