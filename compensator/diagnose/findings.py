@@ -144,14 +144,35 @@ def findings_of(
         How the drive moves, by a search over all data that found a late T_Q.
     """
     found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight)
-    if evidence.is_sparse or all(term.effect.observed for term in found.terms) or _is_no_worse(found):
+    if evidence.is_sparse or all(term.effect.observed for term in found.terms):
         return found
-    # The effects make up for the source. Channels that explain most of it alone take their place.
+    is_no_worse = _is_no_worse(found)
+    if is_no_worse and not _is_surpassed(found):
+        return found
     shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
     rms = found.search.criterion.rms
     nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
-    is_better = in_free_run(shown)[1] < in_free_run(found)[1]
+    if left < hidden:
+        return shown
+    # The effects make up for the source. Channels that explain most of it alone take their place.
+    is_better = not is_no_worse and in_free_run(shown)[1] < in_free_run(found)[1]
     return shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
+
+
+def _is_surpassed(found: Findings) -> bool:
+    """Return whether something known, in the place of a source that no channel shows, leaves less than it does.
+
+    A source has a time and a size of its own for every switching, and leaves to the own error of the paths what it
+    does not explain; by the evidence it may win over their change.
+    """
+    selection, rms = found.selection, found.search.criterion.rms
+    with_it = rms(selection.fit.terms)
+    return any(
+        rms(rival.fit.terms) < with_it
+        for term, rivals in zip(selection.fit.terms, selection.rivals, strict=True)
+        if not term.effect.observed
+        for rival in rivals
+    )
 
 
 def by_channels(found: Findings) -> Findings | None:

@@ -126,7 +126,8 @@ class Search:
             # What was too small to name must not keep out what is not.
             grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
             best = self._pruned(grown)
-        best = self._with_simpler_name(self._exchanged(best, len(best.terms)))
+        # What was left out as too small must not come back in the place of what it was too small beside.
+        best = self._with_simpler_name(self._exchanged(best, len(best.terms), apart_from=grown.places - best.places))
         if hidden := self._hidden(undecided, best):
             best = hidden
         return Selection(
@@ -260,7 +261,7 @@ class Search:
         ]
         return max(fits, key=lambda one: one.log_evidence).terms[-1].start
 
-    def _exchanged(self, fit: Fit, count: int | None = None) -> Fit:
+    def _exchanged(self, fit: Fit, count: int | None = None, *, apart_from: frozenset[Place] = frozenset()) -> Fit:
         """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.
 
         Parameters
@@ -269,10 +270,12 @@ class Search:
             Effects.
         count : int, optional
             How many effects are tried; by default all but the last, which was chosen beside the others.
+        apart_from : frozenset of Place
+            Effects that are not looked for.
         """
         for i in range(min(len(fit.terms), len(fit.terms) - 1 if count is None else count)):
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
-            proposed = self._proposed(others, unobserved=False)
+            proposed = self._proposed(others, unobserved=False, apart_from=apart_from)
             forms = [one for one in proposed if one.places == fit.places and one.forms != fit.forms]
             for candidate in (*forms[:1], *[one for one in proposed[:2] if one.places != fit.places]):
                 better = settled(candidate)

@@ -105,6 +105,22 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     assert [term.hypothesis.place for term in found.terms] == [("nonlinear", "DTF", "")]
 
 
+@pytest.mark.parametrize(
+    ("seed", "why"),
+    [
+        (280_006, "a source of its own for each switching of the heat leaves more of y"),
+        (290_006, "a dead time that is too small beside it does not come back in its place"),
+    ],
+)
+def test_a_loose_couple_is_a_gain(seed: int, why: str) -> None:
+    machine = next(c for c in _cases(seed // 1000 * 1000) if (c.family, c.seed) == ("lumped", seed)).draw()
+    assert machine.truth.effect == "loose_couple"
+    base = tc.identify(machine.calibration.columns).model
+    runs, _ = runs_in(measurements(machine.record.columns, "data", None), base.period_s)
+    found = findings_of(_evidence(base, runs))
+    assert [term.hypothesis.place for term in found.terms] == [("gain", "DTF", "")], why
+
+
 @pytest.fixture(scope="module")
 def called_late() -> Findings:
     """A T_Q that is called late by 4 min, in 6 h: what the engine cannot foretell of it is more than the effect."""
