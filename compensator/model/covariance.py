@@ -27,7 +27,7 @@ from __future__ import annotations
 import functools
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -474,3 +474,18 @@ def _variance(terms: Terms, covariance: list[list[float]]) -> float:
         for j, wj in terms:
             total += wi * wj * covariance[i][j]
     return max(total, 0.0)
+
+
+def may_be_covariance(p: Sequence[float]) -> bool:
+    """Return whether numbers from elsewhere may be a covariance: its upper triangle, row by row.
+
+    No variance is negative, and none of two states explains more of the other than all of it, but for rounding.
+    """
+    size = round((math.sqrt(8.0 * len(p) + 1.0) - 1.0) / 2.0)
+    if len(p) != size * (size + 1) // 2:
+        return False
+    full = np.zeros((size, size))
+    full[np.triu_indices(size)] = p
+    variances = np.diag(full)
+    largest = np.outer(variances, variances)
+    return bool(np.all(variances >= 0.0) and np.all(full**2 <= (1.0 + 1e-6) * largest + 1e-12 * np.max(largest)))

@@ -117,7 +117,14 @@ class OffsetLimiter:
         -------
         Limited
             The next offset, and the expected rate to the one after it.
+
+        Raises
+        ------
+        ValueError
+            If the target is not a number: the limits below would let it pass.
         """
+        if not (math.isfinite(target_um) and math.isfinite(target_rate_um_per_min)):
+            raise ValueError("the target of the offset is not a finite number")
         reasons = []
         wanted = target_um
         if abs(wanted) > self._max_um:

@@ -11,16 +11,18 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
 from compensator.messages import UNREADABLE
+from compensator.model.covariance import may_be_covariance
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
 from compensator.service.plausibility import JumpState, PlausibilityState
+from compensator.service.plausibility.jump_state import Known
 from compensator.service.probing import ProbingState
 
 #: Version of the state; a state of another version is refused.
@@ -30,6 +32,7 @@ STATE_SCHEMA = 1
 LARGEST_COVARIANCE = 1e60
 
 ZeroMode = Literal["auto", "rest", "warm"]
+Minutes = Annotated[float, msgspec.Meta(ge=0)]
 
 
 @dataclass(slots=True)
@@ -49,7 +52,7 @@ class ZeroState:
     """
 
     y_ref: float = NAN
-    y_base: float = 0.0
+    y_base: Known = 0.0
     wanted: bool = False
     mode: ZeroMode = "auto"
 
@@ -123,8 +126,8 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     model_sha256: str
     alternative: str | None
     engine: EngineState
-    guards: dict[str, tuple[float, float, float, float]]
-    offset_um: float
+    guards: dict[str, tuple[float, Minutes, float, Minutes]]
+    offset_um: Known
     zero: ZeroState
     memory: Memory
     plausibility: PlausibilityState | None = None
@@ -205,9 +208,13 @@ def decode_state(data: bytes) -> CompensationState:
     if state.jumps is not None:
         engines += [branch.engine for branch in state.jumps.branches()]
     nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
-    numbers = [state.offset_um]
-    numbers += [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]
+    numbers = [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]
+    # Before the first zero there is no reference.
+    references = [(one.reference.t_q_degc, one.reference.at_degc) for one in nested]
+    numbers += [value for pair in references for value in pair if not all(map(math.isnan, pair))]
     numbers += [value for one in (state.axes or {}).values() for value in (one.offset, one.base)]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
         raise DataError("state: a number of the offset or of the engine is not finite, or too large to be valid")
+    if not all(may_be_covariance(one.observer.p) for one in nested):
+        raise DataError("state: the covariance of the engine cannot be one")
     return state

@@ -355,7 +355,7 @@ def test_the_deviation_is_the_same_after_a_restart_while_the_second_channel_is_s
     assert [encode(o.offset) for o in live] == [encode(o.offset) for o in again]
 
 
-def broken(state: bytes, path: tuple[str, ...], value: Any) -> bytes:
+def broken(state: bytes, path: tuple[str | int, ...], value: Any) -> bytes:
     table = json.loads(state)
     inner = table
     for key in path[:-1]:
@@ -372,10 +372,15 @@ def broken(state: bytes, path: tuple[str, ...], value: Any) -> bytes:
         (("jumps", "beside", "shifts_k"), {"y_um": 1.0}),
         (("memory", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
         (("jumps", "shifted", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
+        (("jumps", "shifted", "engine", "reference", "t_q_degc"), "nan"),
+        (("jumps", "beside", "believing", "engine", "observer", "p", 0), -5.0),
+        (("jumps", "ratio"), "nan"),
+        (("jumps", "again"), {"t_q_degc": -4}),
+        (("jumps", "last"), {}),
     ],
 )
 def test_a_broken_state_is_refused_and_changes_nothing(
-    day: dict[str, np.ndarray], path: tuple[str, ...], value: Any
+    day: dict[str, np.ndarray], path: tuple[str | int, ...], value: Any
 ) -> None:
     compensation = Compensation(settings(), QUILL)
     change = steps((50, "t_q_degc", 8.0), (60, "at_degc", 1.6))

@@ -194,6 +194,28 @@ def test_a_large_residual_holds_where_the_configuration_says_so(day: dict[str, n
     assert len({o.offset.y_offset_um for o in outcomes[held:]}) == 1
 
 
+@pytest.mark.parametrize("missing", ["a sample after the other", "a pause"])
+def test_an_alarm_does_not_end_because_y_is_missing(missing: str) -> None:
+    check = PlausibilityCheck(checked(residual_hold_um=8.0), QUILL)
+
+    def residual(um: float, samples: int) -> None:
+        for _ in range(samples):
+            check.update(
+                SensorEvidence(below_k=0.0, apart_k=0.0, rest=0.0, residual_um=um, std_um=2.3, predicted_um=40.0)
+            )
+
+    residual(0.0, 300)
+    residual(25.0, 120)
+    assert check.too_large
+    if missing == "a pause":
+        check.pass_time(3000)
+    else:
+        residual(math.nan, 1500)  # longer than the window of the blocks
+    assert check.too_large and check.error_um == 25.0
+    residual(1.0, 60)
+    assert not check.too_large
+
+
 def test_a_zero_begins_anew(day: dict[str, np.ndarray]) -> None:
     def jump(i: int, values: dict[str, float]) -> None:
         values["y_um"] += 3.0 if i >= BEGIN else 0.0

@@ -115,11 +115,13 @@ def test_a_settled_covariance_stays_settled() -> None:
     assert [bits(restored.process(r)) for r in raws[1800:]] == [bits(whole.process(r)) for r in raws[1800:]]
 
 
-@given(st.lists(st.floats(), min_size=4, max_size=4), st.floats(), st.floats())
+@given(st.tuples(*[st.floats(), st.floats(min_value=0.0)] * 2), st.floats(), st.floats())
 @settings(max_examples=200, deadline=None)
-def test_every_number_comes_back_to_the_bit(guard: list[float], y_ref: float, missing: float) -> None:
+def test_every_number_comes_back_to_the_bit(
+    guard: tuple[float, float, float, float], y_ref: float, missing: float
+) -> None:
     state = decode_state(Compensation(CONFIG, QUILL).state())
-    state.guards["y_um"] = tuple(guard)  # type: ignore[assignment]
+    state.guards["y_um"] = guard
     state.zero.y_ref, state.memory.missing_min = y_ref, missing
     again = decode_state(encode_state(state))
     before = [*guard, y_ref, missing]
@@ -170,7 +172,12 @@ def changed(state: dict[str, Any], value: Any, *keys: Any) -> dict[str, Any]:
         (changed(at_work(), [0.0], "engine", "observer", "p"), "snapshot of"),
         (changed(at_work(), [[1.0]], "engine", "effects"), "effects"),
         (changed(at_work(), "nan", "engine", "observer", "x", 0), "not finite"),
-        (changed(at_work(), "inf", "offset_um"), "not finite"),
+        (changed(at_work(), "inf", "offset_um"), "offset_um"),
+        (changed(at_work(), "nan", "zero", "y_base"), "y_base"),
+        (changed(at_work(), -5.0, "guards", "t_q_degc", 1), "guards"),
+        (changed(at_work(), "nan", "engine", "reference", "at_degc"), "not finite"),
+        (changed(at_work(), -5.0, "engine", "observer", "p", 0), "covariance"),
+        (changed(at_work(), 1e9, "engine", "observer", "p", 1), "covariance"),
         (changed(at_work(), [0.0], "engine", "gap", "state", "observer", "x"), "snapshot of 1 states"),
         (changed(at_work(), {"x": 1.0}, "engine", "gap", "before", "channels"), "channels"),
         (changed(at_work(with_effects()), [1.0, 2.0], "engine", "effects", PLACE["hysteresis"]), "hysteresis"),

@@ -296,7 +296,11 @@ class PlausibilityCheck:
         else:
             block = ResidualBlock(NAN, 1.0, NAN)
         state.samples, state.used, state.sums = 0, 0, (0.0, 0.0, 0.0)
-        state.blocks = [*state.blocks[-WINDOW + 1 :], block]
+        blocks = [*state.blocks[-WINDOW + 1 :], block]
+        if state.suspects and state.blocks and all(math.isnan(one.residual_um) for one in blocks):
+            # An alarm does not end because Y is missing: the last residual that was seen is the size of the error.
+            blocks[0] = state.blocks[0]
+        state.blocks = blocks
         self._update_cusum(block)
 
     def _update_cusum(self, block: ResidualBlock) -> None:

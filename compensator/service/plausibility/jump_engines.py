@@ -122,7 +122,7 @@ class JumpEngines:
         is_open = bool(state.shifts_k)
         if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.shifts_k) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
-        if not set(state.shifts_k) == set(state.first_k) == set(state.shift_std_k):
+        if not set(state.shifts_k) == set(state.first_k) == set(state.shift_std_k) <= set(state.last):
             raise ValueError("state of a jump whose channels differ")
         beside = state.beside
         if beside is not None and not (

@@ -5,11 +5,16 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from enum import StrEnum
+from typing import Annotated
 
 import msgspec
 
 from compensator.arrays import NAN
 from compensator.model.engine import EngineState, Estimate
+
+#: A number of samples, and a value that is known: a state from a file is refused with any other.
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Known = Annotated[float, msgspec.Meta(ge=-1e60, le=1e60)]
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
@@ -96,30 +101,30 @@ class JumpState(msgspec.Struct, kw_only=True):
     """
 
     level_um: float = NAN
-    shifts_k: dict[str, float] = {}
-    shift_std_k: dict[str, float] = {}
-    first_k: dict[str, float] = {}
-    steps: int = 0
-    again: dict[str, int] = {}
-    quiet: dict[str, int] = {}
+    shifts_k: dict[str, Known] = {}
+    shift_std_k: dict[str, Known] = {}
+    first_k: dict[str, Known] = {}
+    steps: Count = 0
+    again: dict[str, Count] = {}
+    quiet: dict[str, Count] = {}
     phase: Phase = Phase.NONE
-    age: int = 0
-    loose: int = 0
-    last: dict[str, float] = {}
-    unseen: dict[str, int] = {}
-    samples: int = 0
-    ratio: float = 0.0
-    back: dict[str, int] = {}
-    left_k: dict[str, float] = {}
-    moving: int = 0
-    at_held: int = 0
-    y_for: int = 0
-    y_against: int = 0
-    probes_for: int = 0
-    probes_against: int = 0
+    age: Count = 0
+    loose: Count = 0
+    last: dict[str, Known] = {}
+    unseen: dict[str, Count] = {}
+    samples: Count = 0
+    ratio: Known = 0.0
+    back: dict[str, Count] = {}
+    left_k: dict[str, Known] = {}
+    moving: Count = 0
+    at_held: Count = 0
+    y_for: Count = 0
+    y_against: Count = 0
+    probes_for: Count = 0
+    probes_against: Count = 0
     believing: Branch | None = None
     shifted: Branch | None = None
-    learned_um: float = 0.0
+    learned_um: Known = 0.0
     zero_in_use: Estimate | None = None
     beside: JumpState | None = None
 
