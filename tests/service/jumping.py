@@ -76,3 +76,19 @@ def biased(channel: str, size: float, begin: int = BEGIN, end: int = END) -> Cha
 
 def events(outcomes: list[Outcome], code: str) -> list[int]:
     return [i for i, o in enumerate(outcomes) for _, _, data in o.notes if data.get("code") == code]
+
+
+def steps(*found: tuple[int, str, float]) -> Change:
+    """Each channel keeps the last of its steps, K; NaN is missing."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        last = {name: size for begin, name, size in found if begin <= i}
+        for name, size in last.items():
+            values[name] += size
+
+    return change
+
+
+def is_wrong_in_ok(day: dict[str, np.ndarray], outcomes: list[Any], act: Any = lambda i, c: None) -> bool:
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, act=act))) > 5.0
+    return any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))

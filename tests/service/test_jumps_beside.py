@@ -16,7 +16,19 @@ from compensator.errors import DataError
 from compensator.messages import Offset, ProbeRequest, encode, number
 from compensator.service.compensation import Compensation
 from compensator.service.probing import ReceivedProbe
-from tests.service.jumping import BEGIN, END, Change, events, offsets, readings, run, settings, working_day
+from tests.service.jumping import (
+    BEGIN,
+    END,
+    Change,
+    events,
+    is_wrong_in_ok,
+    offsets,
+    readings,
+    run,
+    settings,
+    steps,
+    working_day,
+)
 from tests.service.records import QUILL, sample
 
 Steps = list[tuple[int, str, float]]
@@ -27,24 +39,8 @@ def day() -> dict[str, np.ndarray]:
     return working_day()
 
 
-def steps(*found: tuple[int, str, float]) -> Change:
-    """Each channel keeps the last of its steps, K; NaN is missing."""
-
-    def change(i: int, values: dict[str, float]) -> None:
-        last = {name: size for begin, name, size in found if begin <= i}
-        for name, size in last.items():
-            values[name] += size
-
-    return change
-
-
 def zero_at(sample_number: int) -> Callable[[int, Compensation], None]:
     return lambda i, compensation: compensation.zero("warm") if i == sample_number else None
-
-
-def is_wrong_in_ok(day: dict[str, np.ndarray], outcomes: list[Any], act: Any = lambda i, c: None) -> bool:
-    wrong = np.abs(offsets(outcomes) - offsets(run(day, act=act))) > 5.0
-    return any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
 
 
 def test_at_that_is_back_before_t_q_leaves_t_q_in_question(day: dict[str, np.ndarray]) -> None:

@@ -339,7 +339,13 @@ def _move(
         is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
     else:
         is_back = _has_returned(difference, std, shift, state.first_k[name])
-    state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
+        # One sample after others without it may have been wrong: what is expected is as uncertain as it was then.
+        is_back |= not (state.is_suspect or is_unsteady(state)) and abs(difference) <= _RETURNED * abs(shift)
+    back = state.back.get(name, 0)
+    is_settling = 0 < back < needed_samples(state) and not state.is_air
+    if is_settling and abs(difference - state.left_k.get(name, 0.0)) > max(NEAR * std, 0.5 * least_k):
+        back = 0  # what is left of a jump is where the channel comes to rest
+    state.back[name] = back + 1 if is_back else 0
     if state.back[name] <= 1:
         is_part = is_back and abs(difference) > max(0.0 if state.is_air else NEAR * std, least_k)
         state.left_k[name] = difference if is_part else 0.0
@@ -411,7 +417,9 @@ def count_held(state: JumpState, engine: Engine, at_degc: float, least_k: float)
     expected, std = expected_value(engine, "at_degc", NAN)
     first_k, difference = state.first_k.get("at_degc", NAN), at_degc - expected
     # Air goes back little by little. A couple that is half pushed in jumps back, and part of the way.
-    is_air = abs(difference) <= least_k or state.shifts_k.get("at_degc") == first_k
+    is_air = abs(difference) <= least_k or (
+        state.shifts_k.get("at_degc") == first_k and not state.left_k.get("at_degc")
+    )
     is_back = is_air and list(state.shifts_k) == ["at_degc"] and _has_returned(difference, std, first_k, first_k)
     state.at_held = state.at_held + 1 if is_back else 0
 

@@ -153,10 +153,10 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         by = confirmed_by(state)
         if by:
             return _accept(engine, engines, state, offered, None, f"is confirmed: {by} with it")
-        if only_at and state.back.get("at_degc", 0) >= needed_samples(state):
-            if state.left_k.get("at_degc"):
+        if all(state.back.get(name, 0) >= needed_samples(state) for name in state.shifts_k):
+            if only_at and state.left_k.get("at_degc"):
                 state.keep_what_is_left()
-            elif engines.agree():
+            elif (only_at or not is_unsteady(state)) and not any(state.left_k.values()) and engines.agree():
                 return _accept(engine, engines, state, offered, None, "has returned to what was expected before")
         # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
         is_refuted |= is_contradicted(state) and not is_unsteady(state)

@@ -347,15 +347,21 @@ class OneJump:
         elif engines is not None and state.is_watched:
             jumped = self._going_on(engines, offered)
             if state.is_air and "t_q_degc" in self._watchable(engine, offered):
-                # One of both is wrong: what T_Q has shown of AT counts no more, nor AT of T_Q.
-                state.phase = Phase.UNCONFIRMED
-                state.start_evidence()
+                self._question_both()
                 jumped = ["t_q_degc", *jumped]
         if self.state.shifts_k:
             known = {*jumped, *self.state.shifts_k}
             unexpected = self._unexpected(engine, offered, seen_again)
-            jumped = [*jumped, *(n for n in unexpected if n not in known and not self._is_for_beside(n))]
+            more = [name for name in unexpected if name not in known and not self._is_for_beside(name)]
+            if more and self.state.is_watched:
+                self._question_both()
+            jumped = [*jumped, *more]
         return jumped, notes
+
+    def _question_both(self) -> None:
+        """Ask about both channels: one of them is wrong, so what T_Q has shown of AT counts no more, nor AT of T_Q."""
+        self.state.phase = Phase.UNCONFIRMED
+        self.state.start_evidence()
 
     def _entered(
         self,
@@ -512,8 +518,16 @@ class OneJump:
     # ------------------------------------------------------------------ signs
 
     def _unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
+        """Return the channels that, seen again, differ from what one of the engines that may be right expects."""
         signs = self._setup.signs
-        return [n for n in signs.unexpected(engine, offered, seen_again) if n in self._names] if signs else []
+        if signs is None:
+            return []
+        may_be_right = [engine]
+        if self._engines is not None and not self.state.is_suspect:
+            # An engine that believes air which is none explains a T_Q that is wrong by heat.
+            may_be_right.append(self._engines.shifted.engine)
+        found = {name for one in may_be_right for name in signs.unexpected(one, offered, seen_again)}
+        return [name for name in self._names if name in found]
 
     def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
         signs = self._setup.signs
