@@ -111,6 +111,11 @@ class Continuity:
         )
 
     @property
+    def waits_for_resume(self) -> bool:
+        """Whether a person's `resume` would change which sensors are believed."""
+        return self.plausibility.exchanged or bool(self._jumps.suspects or self._jumps.unconfirmed)
+
+    @property
     def further_targets(self) -> dict[str, float]:
         """Offsets of the further outputs by the model, before limits, by name; NaN without an estimate."""
         found = self.outputs.predictions(self._memory.estimate)
@@ -236,10 +241,10 @@ class Continuity:
         if not self._engine.has_reference:
             return
         is_cold = minutes > self.bridge_max_min
-        self._jumps.pass_time(min(samples, MOST_BRIDGED), held=is_cold)
         if is_cold:
             self._pass_cold(min(samples, MOST_BRIDGED))
         else:
+            self._jumps.pass_time(samples, held=False)
             self._memory.estimate = self._engine.skip(samples)
         if self.probing is not None and self._memory.estimate is not None:
             self.probing.pass_time(self._memory.estimate.contributions_um, minutes)
@@ -250,6 +255,7 @@ class Continuity:
         return min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED)
 
     def _pass_cold(self, samples: int) -> None:
+        self._jumps.pass_time(samples, held=True)
         self._memory.estimate = self._engine.skip(samples, held=True)
         self._memory.cold_min = KNOWN_AFTER * self.slowest_min
 

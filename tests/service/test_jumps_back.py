@@ -7,7 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from tests.service.jumping import BEGIN, END, is_wrong_in_ok, run, steps, working_day
+from compensator.messages import Event
+from compensator.service.compensation import Compensation
+from compensator.service.replay import RecordedStep
+from compensator.service.state import decode_state
+from compensator.service.transfer.candidate import RecordedRun
+from tests.service.jumping import BEGIN, END, is_wrong_in_ok, readings, run, settings, steps, working_day
+from tests.service.records import QUILL, sample
 
 #: Long enough for what is asked about to be decided.
 LATER = END + 120
@@ -62,3 +68,49 @@ def test_a_door_does_not_hide_a_jump_of_t_q_that_nobody_saw(
     assert not is_wrong_in_ok(day, outcomes)
     asked = {"suspect_channel:t_q_degc", "unconfirmed_channel:t_q_degc"}
     assert all(asked & set(map(str, o.offset.reasons)) for o in outcomes[begin + 7 : END])
+
+
+def test_jumps_of_yesterday_make_no_loose_contact_after_a_night(day: dict[str, np.ndarray]) -> None:
+    compensation = Compensation(settings(), QUILL)
+    change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 5, "t_q_degc", 0.0))
+    for i in range(BEGIN + 20):
+        values = readings(day, i)
+        change(i, values)
+        compensation.process(sample(i, values))
+
+    def quiet() -> dict[str, int]:
+        jumps = decode_state(compensation.state()).jumps
+        assert jumps is not None
+        return jumps.quiet
+
+    before = quiet()["t_q_degc"]
+    compensation.pause(30)
+    assert quiet() == {"t_q_degc": before + 30}
+    compensation.pause(600)
+    assert quiet() == {}
+
+
+def test_what_a_person_has_confirmed_another_model_does_not_ask_about(day: dict[str, np.ndarray]) -> None:
+    """A warm-up, and the comparison before an adoption, get the person's `resume` from the record."""
+    conf = settings()
+    run_again = RecordedRun(conf, Compensation(conf, QUILL))
+    asked = []
+    for i in range(200, BEGIN + 60):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += 6.0 if i >= BEGIN else 0.0
+        raw = sample(i, values)
+        resume = Event(
+            schema=1,
+            machine=raw.machine,
+            seq=i,
+            time_utc_ns=raw.time_utc_ns,
+            kind="command",
+            text="resume",
+            data={"command": "resume"},
+        )
+        events = [resume] if i == BEGIN + 30 else []
+        step = RecordedStep(file="a.mcap", run={"file": "a.mcap"}, records={}, events=events, sample=raw)
+        outcome = run_again.process(step)
+        assert outcome is not None
+        asked.append("suspect_channel:t_q_degc" in outcome.offset.reasons)
+    assert asked == [BEGIN <= i < BEGIN + 30 for i in range(200, BEGIN + 60)]

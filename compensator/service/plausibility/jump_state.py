@@ -187,9 +187,13 @@ class JumpState(msgspec.Struct, kw_only=True):
         quiet = dict.fromkeys(self.shifts_k, 0) if self.is_suspect else {}
         return JumpState(unseen=self.unseen, again=self.again, quiet=self.quiet | quiet)
 
-    def count_quiet(self) -> None:
-        """Count a sample without a jump under way."""
-        self.quiet = {name: n + 1 for name, n in self.quiet.items() if n + 1 < FORGOTTEN_SAMPLES}
+    def count_quiet(self, samples: int = 1) -> None:
+        """Count samples without a jump under way."""
+        self.quiet = {name: n + samples for name, n in self.quiet.items() if n + samples < FORGOTTEN_SAMPLES}
+
+    def remember(self, beside: JumpState) -> None:
+        """Take over how often a channel has jumped beside these, and how long ago."""
+        self.again, self.quiet = self.again | beside.again, self.quiet | beside.quiet
 
     @property
     def most_again(self) -> int:

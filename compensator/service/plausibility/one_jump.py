@@ -180,6 +180,8 @@ class OneJump:
         unseen = self.state.unseen
         self.state.unseen = {} if held else {name: unseen.get(name, 0) + samples for name in self._names}
         self.state.start_counts()
+        if not self.is_open:
+            self.state.count_quiet(samples)
         if self._engines is not None:
             self._engines.pass_time(samples, held=held)
         if self._beside is not None:
@@ -187,8 +189,15 @@ class OneJump:
 
     def end(self) -> None:
         """Use all channels as they are."""
-        self._engines = self._beside = None
+        self._leave_beside()
+        self._engines = None
         self.state = self.state.ended()
+
+    def _leave_beside(self) -> None:
+        """End the watch beside, which knows how loose its channel is."""
+        if self._beside is not None:
+            self.state.remember(self._beside.state)
+        self._beside = None
 
     # ------------------------------------------------------------------ what others say
 
@@ -317,7 +326,7 @@ class OneJump:
         if verdict.ends:
             estimate = self._finish(engine, verdict, estimate, offered, others)
         elif not self.state.is_suspect:
-            self._beside = None
+            self._leave_beside()
         return Judgement(
             estimate,
             [*notes, *beside.notes, *verdict.notes],
@@ -382,7 +391,9 @@ class OneJump:
             return [jump_note(name, state.shifts_k[name]) for name in told]
         if not state.is_unconfirmed:
             return []
-        when = {name: AIR if state.is_air else UNSEEN if name in unseen else BESIDE for name in fed.jumped}
+        when = {name: UNSEEN if name in unseen else BESIDE for name in fed.jumped}
+        if state.is_air:
+            when["at_degc"] = AIR
         return [unconfirmed_note(name, state.shifts_k[name], when[name]) for name in fed.jumped]
 
     def _verdict(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Verdict:
@@ -453,7 +464,7 @@ class OneJump:
         """Judge the other channel; `unseen` counts the samples without each channel before this one."""
         names = [name for name in self._names if self._is_for_beside(name)]
         if not names:
-            self._beside = None
+            self._leave_beside()
             return Judgement()
         if self._beside is None:
             self._beside = OneJump(self._setup, tuple(names))

@@ -178,8 +178,8 @@ class RecordedRun:
                 self.compensation.zero(step.zero)
             channels = {name: channel for name, channel in step.sample.channels.items() if name in self.channels}
             # The zero is set above; of the other events only the pauses concern another model, and that a person has
-            # seen to exchanged couples: it must not wait for this again.
-            if self.compensation.plausibility.exchanged and any(map(_is_resume, step.events)):
+            # seen to the couples: it must not wait for this again.
+            if self.compensation.waits_for_resume and any(map(_is_resume, step.events)):
                 self.compensation.resume()
             events = [event for event in step.events if event.kind == EventKind.RESTART]
             sample = msgspec.structs.replace(step.sample, channels=channels)
