@@ -1,57 +1,7 @@
 """Jumps of T_Q and AT: a channel that has jumped is not used until its new value is confirmed.
 
-From the jump on, two more engines run beside the one that predicts without the channel:
-
-- *believing* takes the channel as it is;
-- *shifted* takes it less the jump: the sensor still follows its temperature, but with another zero.
-
-The channel is accepted again if
-
-- it returns to what the shifted engine expects (a contact is mended): the state becomes that of the shifted engine,
-  which knows what happened meanwhile;
-- the model agrees with it: over the last samples the believing engine has expected T_Q and AT better than the shifted
-  one, by a log likelihood ratio (T_Q follows AT, and heat that rises stays). The state becomes that of the believing
-  one;
-- measured Y, or two probes, agree with the believing engine and contradict the shifted one;
-- an operator says so: `resume` believes it, a zero keeps the state and gives the sensor its new zero.
-
-A jump within `rate_max_per_min` is used at first; with `jump_min_k` both engines run for some samples, unless heat
-within its range of validity explains a jump of T_Q. A channel that goes on to move like that is still in the same
-jump, which takes some samples. Where the shifted one expects them far better, the channel becomes suspect and the state
-that of the shifted engine: what the wrong values did is undone.
-
-A jump may also hide in samples without the channel: its couple was open, or the service was stopped. With `jump_min_k`
-a channel that then reads otherwise than expected is *unconfirmed*: heat or air that changed meanwhile looks the same.
-It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
-one of them.
-
-AT that moves within the permitted rate while T_Q does not follow is *unconfirmed*, too, not suspect: T_Q follows the
-air as slowly as the machine does, and a door looks like that. Once AT has returned, what the shifted engine expected is
-believed if T_Q has spoken for it, and the other answer is the doubt, until both agree.
-
-A channel that returns by most of its jump, but not by all of it, has jumped by what is left (from `jump_min_k` on): its
-couple was pushed in halfway.
-
-A loose contact jumps again and again: it has no level that the shifted engine could follow, which goes without it. Of
-T_Q its expectation is soon too wide for a return to show. Once the channel has come to rest, for as long as it would
-have to be back, and where the shifted engine thinks possible, it is like a couple that was open: used again, and
-unconfirmed. The believing engine starts with its last jump.
-
-An unconfirmed channel that jumps again says that it is wrong now, not that it was wrong before. Unless something has
-contradicted it, or it was at rest for a shorter time than it was loose before, the compensation's engine keeps what it
-has shown and goes on without it. The shifted engine still believes none of it; their difference stays part of the
-standard deviation. The channel is believed anew from the one of both that expects its new level rather: where it comes
-to rest elsewhere, one of both levels was wrong.
-
-While one channel is suspect, the other one has a watch of its own *beside*, for which the shifted engine is that of the
-compensation. What it finds wrong is undone in the compensation's engine, too. Once the suspect channel is used again,
-the watch beside goes on alone. AT is judged by T_Q, which follows it: while T_Q is missing it is only watched.
-
-A zero on a warm machine is not of one of both answers: each engine counts from what it predicted then, and if the
-compensation's engine is given the state of another one, its zero goes with it. What probes have corrected since a jump
-may be the jump: probes are compared as if they had not.
-
-Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
+From the jump on, two more engines run beside the one that predicts without the channel: the *believing* one takes the
+channel as it is, the *shifted* one less the jump. What happens until it is decided, by phases: README.md of this folder.
 """
 
 from __future__ import annotations
