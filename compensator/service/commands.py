@@ -24,7 +24,7 @@ from compensator.service.replay import execute
 from compensator.service.transfer.adoption import Adoption, ModelRequest
 from compensator.service.transfer.second_opinion import described
 
-#: Largest number of commands that wait for the next sample.
+#: Largest number of commands that wait for the next sample. A `hold` has one more place: it stops the offset.
 WAITING_COMMANDS = 100
 #: Largest number of probes that wait for the next sample to be compared with the prediction.
 WAITING_PROBES = 20
@@ -79,7 +79,7 @@ class Commands:
         self._admitted: list[ReceivedProbe] = []
         self._unused: list[Probe] = []
         self._more = 0
-        self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
+        self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue()
         self._refused = 0
         #: Whether an answer about the candidate of the loop waits for the next sample.
         self._is_answered = False
@@ -103,7 +103,7 @@ class Commands:
                 loop.call_soon_threadsafe(self._receive_probe, payload, sender, self._clock.utc_ns(), decided)
                 return decided
             arguments = self._checked(name, payload)
-            if loop is None or self._waiting.full():
+            if loop is None or self._is_full(name):
                 raise ServiceError("the service cannot accept a command now")
             if name in (CommandName.ADOPT, CommandName.BACK, CommandName.DISMISS):
                 request = ModelRequest.of(name, arguments)
@@ -254,8 +254,11 @@ class Commands:
             )
         return arguments
 
+    def _is_full(self, name: str) -> bool:
+        return self._waiting.qsize() >= WAITING_COMMANDS + (name == CommandName.HOLD)
+
     def _enqueue(self, name: str, arguments: dict[str, Any], sender: Sender) -> None:
-        if self._waiting.full():
+        if self._is_full(name):
             self._note_refusal(name, "too many commands are waiting", sender)
         else:
             self._waiting.put_nowait((name, arguments, sender))

@@ -14,6 +14,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.recording.reading import read_messages, recordings
+from compensator.service.commands import WAITING_COMMANDS
 from compensator.service.publisher import Publisher, Sender, _payload, longest
 from compensator.service.session import session_config
 from tests.audit.made import MACHINE
@@ -55,6 +56,21 @@ async def test_a_payload_that_is_too_long_is_refused_before_it_is_copied(
     (reply,) = replies
     text = reply.result(timeout=0)["text"] if isinstance(reply, Future) else reply["text"]
     assert text == f"{name}: the payload is longer than {longest(name)} bytes"
+
+
+async def test_a_hold_is_taken_however_many_commands_wait(tmp_path: Path) -> None:
+    bench = replayable(tmp_path)
+
+    def flood() -> None:
+        for _ in range(3 * WAITING_COMMANDS):
+            bench.daemon.command("zero", b'{"mode": "warm"}', ANNA)
+        bench.daemon.command("hold", b"", ANNA)
+
+    bench.at_sample[20] = flood
+    await bench.run(40)
+    said = [e["text"] for e in events(tmp_path / "rec", "command")]
+    assert said == ["zero"] * WAITING_COMMANDS + ["hold"]
+    assert "operator_hold" in bench.outcomes[-1].offset.reasons
 
 
 async def test_the_recording_says_who_commanded_whatever_the_payload_says(tmp_path: Path) -> None:
