@@ -1,7 +1,8 @@
 """Jumps of T_Q and AT: a channel that has jumped is not used until its new value is confirmed.
 
 From the jump on, two more engines run beside the one that predicts without the channel: the *believing* one takes the
-channel as it is, the *shifted* one less the jump. What happens until it is decided, by phases: README.md of this folder.
+channel as it is, the *shifted* one less the jump. What happens until it is decided, by phases: README.md of
+this folder.
 """
 
 from __future__ import annotations
