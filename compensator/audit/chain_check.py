@@ -99,6 +99,8 @@ class ChainCheck:
                 self._next = sequence + 1
                 return
         result, value, number, entries = self._result, self.head, self._next, []
+        if result.seal and not records:
+            result.find(Fault.BEHIND_SEAL, message)
         whole = True
         for topic, its_number, its_time, its_body in records:
             before = value
@@ -325,6 +327,9 @@ class ChainCheck:
         result.seal = "" if seal.reason == "hour" else seal.reason
         if (seal.sha256, seal.sequence) != (before.hex(), record.sequence - 1):
             result.find(Fault.SEAL_CHANGED, record)
+        elif record.body != chain.body_of(record.sequence, seal.time_utc_ns, encode(seal)):
+            # A signature is over what was decoded; nothing signs the record itself where it is the last one.
+            result.find(Fault.SEAL_NOT_WHOLE, record)
         if not seal.signature:
             result.sealed_signed = False
             self._add_unsigned(record.topic, record.log_time_ns, record.body)
@@ -336,7 +341,7 @@ class ChainCheck:
             result.find(Fault.FALSE_SIGNATURE, record)
             self._add_unsigned(record.topic, record.log_time_ns, record.body)
         elif (seal.sha256, seal.sequence) == (before.hex(), record.sequence - 1):
-            self._covered(record.log_time_ns)
+            self._covered(seal.time_utc_ns)
 
     def _add_unsigned(self, topic: str, time_ns: int, body: bytes) -> None:
         """Count a record that no signature covers yet.

@@ -51,6 +51,11 @@ class Fault(Enum):
     BEHIND_CHAIN = AuditFinding.INSERTED, "{count} record(s) after the last message of the chain"
     NO_SEAL = AuditFinding.REMOVED, "the file has its end, but the seal before it is missing"
     SEAL_CHANGED = AuditFinding.ALTERED, "does not seal the records before it"
+    SEAL_NOT_WHOLE = (
+        AuditFinding.ALTERED,
+        "is not what was sealed: another time than the one it states, or bytes that are no part of a seal",
+    )
+    BEHIND_SEAL = AuditFinding.INSERTED, "nothing follows the seal of an end"
     FALSE_SIGNATURE = AuditFinding.FALSE_SIGNATURE, "not signed with the given key"
     # The file as a whole.
     UNREADABLE = AuditFinding.UNREADABLE, "{what}"

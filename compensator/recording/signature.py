@@ -86,10 +86,11 @@ def _verified(key: Any, data: bytes, signature: str) -> bool:
     from cryptography.exceptions import InvalidSignature
 
     try:
-        key.verify(bytes.fromhex(signature), data)
+        made = bytes.fromhex(signature)
+        key.verify(made, data)
     except (InvalidSignature, ValueError):
         return False
-    return True
+    return made.hex() == signature  # spaces and capitals would be no part of what is signed
 
 
 def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[ConfigError] | type[UsageError]) -> Any:

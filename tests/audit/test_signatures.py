@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer, Verifier
 from compensator.service.loading import load_signer
 from tests.audit.attacks import rechained, without_seals
-from tests.audit.made import CONFIG, MACHINE, Service
+from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import Line, find, lines_of, rewrite, with_new_values
 
 
@@ -103,6 +104,103 @@ def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path
     found = audit([path_in(tmp_path / "rec")], public_key=public)
     assert found.clean and f"{9 * 3} record(s) after the last signature" in " ".join(found.remarks)
     service.kill()
+
+
+# ------------------------------------------------------------------ a seal as a whole
+
+
+def _also(text: bytes) -> Callable[[Line], Line]:
+    return lambda line: replace(line, data=line.data[:-1] + text + b"}")
+
+
+def _turned(line: Line) -> Line:
+    return replace(line, data=encode(dict(reversed(msgspec.json.decode(line.data).items()))))
+
+
+def _signature(change: Callable[[str], str]) -> Callable[[Line], Line]:
+    def changed(line: Line) -> Line:
+        seal = msgspec.json.decode(line.data, type=Seal)
+        return replace(line, data=encode(msgspec.structs.replace(seal, signature=change(seal.signature))))
+
+    return changed
+
+
+def _later(minutes: int) -> Callable[[Line], Line]:
+    return lambda line: replace(line, time_ns=line.time_ns + minutes * MINUTE_NS)
+
+
+#: What is no part of the bytes that are signed.
+UNSIGNED_BYTES: dict[str, Callable[[Line], Line]] = {
+    "a key": _also(b',"note":"approved by QA"'),
+    "a key again": _also(b',"reason":"stop"'),
+    "a space": _also(b" "),
+    "another order": _turned,
+    "capitals": _signature(str.upper),
+    "spaces": _signature(lambda text: f"{text[:2]} {text[2:]}"),
+    "a day later": _later(1440),
+    "a minute earlier": _later(-1),
+}
+
+
+SIGNATURES = [UNSIGNED_BYTES[name] for name in ("capitals", "spaces")]
+
+
+@pytest.mark.parametrize("change", UNSIGNED_BYTES.values(), ids=UNSIGNED_BYTES)
+@pytest.mark.parametrize("finished", [True, False])
+def test_no_byte_of_the_last_seal_is_unsigned(
+    signed: tuple[Path, Path], change: Callable[[Line], Line], finished: bool
+) -> None:
+    """No seal after it covers its record; whoever makes the chain anew may write the rest of it as he likes."""
+    folder, public = signed
+    path = path_in(folder)
+    contents = lines_of(path)[1]
+
+    def changed(lines: list[Line]) -> list[Line]:
+        at = find(lines, "seal", -1)
+        seal = change(lines[at])
+        return [*lines[:at], seal, replace(lines[at + 1], time_ns=seal.time_ns)]
+
+    if finished:
+        rewrite(path, lambda lines: with_new_values(changed(lines), contents))
+    else:
+        rechained(path, changed)
+    found = audit([path], public_key=public)
+    kind = "altered" if change not in SIGNATURES else "false_signature"
+    assert [(finding.kind, finding.topic) for finding in found.findings] == [(kind, "seal")], summary(found)
+    assert audit([path]).clean == (change in SIGNATURES)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_nothing_follows_the_seal_of_an_end(signed: tuple[Path, Path], count: int) -> None:
+    folder, public = signed
+    path = path_in(folder)
+    contents = lines_of(path)[1]
+
+    def longer(lines: list[Line]) -> list[Line]:
+        last = lines[-1]
+        return [*lines, *(replace(last, sequence=last.sequence + 1 + i, time_ns=i) for i in range(count))]
+
+    rewrite(path, lambda lines: with_new_values(longer(lines), contents))
+    found = audit([path], public_key=public)
+    assert found.findings_count == count and "nothing follows the seal of an end" in found.findings[0].line()
+
+
+@pytest.mark.parametrize("minutes", [-60, -1, 1, 30, 60, 67])
+def test_the_time_of_a_seal_is_the_one_that_is_signed(tmp_path: Path, minutes: int) -> None:
+    """A later one would make what follows it young, although its next seal was removed."""
+    private, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec", signer=Signer(private)).run(140).kill()
+    path = path_in(tmp_path / "rec")
+
+    def shifted(lines: list[Line]) -> list[Line]:
+        first, second = find(lines, "seal", 0), find(lines, "seal", 1)
+        kept = [*lines[:second], *lines[second + 2 :]]
+        return [_later(minutes)(line) if i in (first, first + 1) else line for i, line in enumerate(kept)]
+
+    rechained(path, shifted)
+    found = audit([path], public_key=public)
+    assert [finding.kind for finding in found.findings] == ["unsigned", "altered"], summary(found)
+    assert "79 sample(s), 79 min" in summary(found) and "another time than the one it states" in summary(found)
 
 
 # ------------------------------------------------------------------ keys
