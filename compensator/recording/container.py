@@ -59,6 +59,11 @@ __all__ = [
 MAGIC = b"\x89MCAP0\r\n"
 #: Longest record and chunk that is accepted, bytes; those of the recorder are below 2 MiB.
 LONGEST = 64 * 2**20
+#: Most bytes of a file that are read, those in chunks counted uncompressed, too: zeros take no space on a disk, but
+#: time to read. A recorder goes on in a new file at a quarter of that (`live_file.py`).
+LARGEST = 2**30
+#: Most zeros at the end of a file that a power cut may have left: more than is written at once.
+_MOST_ZEROS = 2**24
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
 #: Number of notes on bytes without content, and of flaws, that are kept.
@@ -124,6 +129,7 @@ class Flaw(StrEnum):
 
     WRONG_CRC = "its CRC is wrong"
     TWICE = "occurs twice"
+    NOT_FIRST = "is not at the start of the file"
     LATE = "follows messages"
 
 
@@ -199,6 +205,8 @@ class Container:
         #: Place of the buffer in the file, and place in the buffer.
         self._base = self._at = 0
         self._crc = 0
+        #: Number of bytes read, those uncompressed counted as well, and of those kept: everything but messages.
+        self._read = self._kept = 0
 
     def __enter__(self) -> Container:
         return self
@@ -352,13 +360,14 @@ class Container:
         fields.done()
         if size > LONGEST:
             raise Damaged(self.path, offset, f"a chunk of {size} bytes, expected at most {LONGEST}")
+        self._count(size)
         try:
             if compression == "zstd":
                 # The size in the frame is allocated before decompression, so it is checked first.
                 stated = zstandard.frame_content_size(data)
                 if stated not in (-1, size):
                     raise Damaged(self.path, offset, f"a chunk of {size} bytes whose data state {stated}")
-                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size or 1)
+                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size or 1, allow_extra_data=False)
             elif compression:
                 raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd or none")
         except (zstandard.ZstdError, ValueError) as error:
@@ -374,11 +383,19 @@ class Container:
     def _other(self, code: int, body: bytes, offset: int) -> None:
         fields = Fields(self.path, offset, body)
         contents = self.contents
+        if code != MESSAGE_INDEX:
+            self._kept += len(body)
+            if self._kept > LONGEST:
+                raise Damaged(self.path, offset, f"more than {LONGEST} bytes besides messages")
         if code == HEADER:
             if fields.text():
                 self._note("the header names a profile")
-            contents.library = fields.text()
+            library = fields.text()
             fields.done()
+            if offset == len(MAGIC):
+                contents.library = library
+            else:
+                self._add_flaw("a header", Flaw.NOT_FIRST)
         elif code == SCHEMA:
             number = fields.number("<H")
             described = (fields.text(), fields.text(), fields.bytes4())
@@ -413,7 +430,7 @@ class Container:
             if not crc:
                 self._note(f"attachment {name} has no CRC")
             elif zlib.crc32(body[:-4]) != crc:
-                contents.flaws.append((f"attachment {name}", Flaw.WRONG_CRC))
+                self._add_flaw(f"attachment {name}", Flaw.WRONG_CRC)
             self._keep(
                 contents.attachments, name, Attachment(name, media_type, log_time, create_time, data), "attachment"
             )
@@ -435,9 +452,12 @@ class Container:
         """
         if not (is_there or self.contents.messages):
             return True
-        if len(self.contents.flaws) < _MOST_FLAWS:
-            self.contents.flaws.append((what, Flaw.TWICE if is_there else Flaw.LATE))
+        self._add_flaw(what, Flaw.TWICE if is_there else Flaw.LATE)
         return False
+
+    def _add_flaw(self, what: str, flaw: Flaw) -> None:
+        if len(self.contents.flaws) < _MOST_FLAWS:
+            self.contents.flaws.append((what, flaw))
 
     def _end(self, body: bytes) -> None:
         """Read the summary up to the end of the file."""
@@ -494,8 +514,16 @@ class Container:
             return
         self._crc = zlib.crc32(self._buffer[: self._at], self._crc)
         self._base += self._at
-        self._buffer = self._buffer[self._at :] + self._file.read(max(count - have, _WINDOW))
-        self._at = 0
+        self._buffer, self._at = self._buffer[self._at :], 0
+        more = self._file.read(max(count - have, _WINDOW))
+        self._count(len(more))
+        self._buffer += more
+
+    def _count(self, size: int) -> None:
+        """Count bytes that are read; beyond the limit the file is damaged, whatever it holds."""
+        self._read += size
+        if self._read > LARGEST:
+            raise Damaged(self.path, self.position, f"more than {LARGEST} bytes, those in chunks uncompressed")
 
     def _frame(self) -> tuple[int, int]:
         """Return kind and length of the current record, with the whole record in the buffer."""
@@ -529,9 +557,12 @@ class Container:
 
     def _only_zeros(self) -> bool:
         """Return whether only zeros follow, which a power cut may leave at the end of a file."""
+        begin = self.position
         while True:
             if self._buffer[self._at :].strip(b"\0"):
                 return False
+            if self.position - begin > _MOST_ZEROS:
+                raise Damaged(self.path, begin, f"more than {_MOST_ZEROS} zeros, expected a record")
             self._at = len(self._buffer)
             self._need(1)
             if len(self._buffer) == self._at:

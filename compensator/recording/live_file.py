@@ -16,9 +16,11 @@ from compensator.errors import DataError
 from compensator.messages import encode, shipped_schema
 from compensator.messages_axes import ALL_MESSAGES, message_of
 from compensator.recording import chain
-from compensator.recording.container import Attachment, Contents, McapChannel
+from compensator.recording.container import LARGEST, Attachment, Contents, McapChannel
 from compensator.recording.signature import Signer
 
+#: Size of a file, bytes, from which a recorder goes on in a new one, so that every file is read whole, compact or not.
+FULL = LARGEST // 4
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
 TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 #: Topics of a machine whose Y is probed.
@@ -71,6 +73,11 @@ class LiveFile:
         self.writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
         #: Bytes that are on disk.
         self.synced = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next messages belong in a new file; never between two syncs, which write one file."""
+        return self.synced == self._sink.size >= FULL
 
     def sync(self) -> None:
         """Write everything to disk."""

@@ -1,9 +1,9 @@
 """Writes every sample to MCAP so that a kill loses nothing.
 
-A new file is started every day and at each start. The live file is not chunked; every sample is synced to disk before
-its offset is published. The configuration, the model and the state of the compensation are attached to each file. A
-hash chain covers everything (`recording/chain.py`) and continues from file to file; if a key is configured, it is
-signed every hour and at the end. `recording/finishing.py` compacts finished files.
+A new file is started every day, at each start, and where one is full. The live file is not chunked; every sample is
+synced to disk before its offset is published. The configuration, the model and the state of the compensation are
+attached to each file. A hash chain covers everything (`recording/chain.py`) and continues from file to file; if a key
+is configured, it is signed every hour and at the end. `recording/finishing.py` compacts finished files.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class McapRecorder:
         """
         day = day_of(time_utc_ns)
         try:
-            if self._live is None or day != self._day:
+            if self._live is None or day != self._day or self._live.is_full:
                 self._finish("day")
                 self._open(
                     time_utc_ns, day, {"state.json": state() if callable(state) else state} | dict(opening or {})

@@ -11,7 +11,7 @@ import json
 import logging
 import threading
 from collections import deque
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +34,8 @@ log = logging.getLogger("compensator")
 SYNC_S = 2.0
 #: Largest number of queued messages; beyond that the oldest are dropped and counted.
 WAITING = 200_000
+#: Most messages that are written at once, so that a file is not much longer than full.
+PART = 10_000
 #: Largest number of channels in one file, so that arbitrary keys cannot fill the memory.
 CHANNELS = 20_000
 #: Prefix of the file names of a shop's recordings.
@@ -155,11 +157,11 @@ class ShopRecorder:
         return True
 
     def _write(self, batch: list[_Arrival]) -> None:
-        """Write a batch, each day to its own file; remove written messages from the batch."""
+        """Write a batch, each day to files of its own; remove written messages from the batch."""
         while batch:
             day, same = next(groupby(batch, lambda arrival: day_of(arrival.time_ns)))
-            part = list(same)
-            if self._file is None or day != self._day:
+            part = list(islice(same, PART))
+            if self._file is None or day != self._day or self._file.is_full:
                 self._finish()
                 self._file, self._day = _File(self._folder, part[0].time_ns, self._prefix), day
                 self.files.append(self._file.path)

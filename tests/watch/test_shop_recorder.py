@@ -114,6 +114,16 @@ def test_each_day_has_its_file(tmp_path: Path) -> None:
     assert [[one[2] for one in read(path)] for path in recordings(tmp_path)] == [[0, 1], [2, 3]]
 
 
+def test_a_full_file_is_followed_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_file, "FULL", 50_000)
+    monkeypatch.setattr(shop_recorder, "PART", 10)
+    with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
+        for number in range(200):
+            recorder.receive(KEY + "y/offset", offset(number))
+    assert len(recorder.files) > 1
+    assert [one[2] for path in recorder.files for one in read(path)] == list(range(200))
+
+
 KILLED = """
 import os, sys, time
 from compensator.clock import SystemClock
