@@ -16,6 +16,7 @@ from compensator.codes import AuditFinding, RecordingEnd
 from compensator.errors import CompensatorError, DataError
 from compensator.messages import UNREADABLE
 from compensator.recording.container import Container, Damaged, Torn
+from compensator.recording.naming import named_of
 from compensator.recording.reading import RawRecord, groups_of
 from compensator.recording.signature import Verifier
 
@@ -80,7 +81,7 @@ class _Audit:
         except Damaged as damage:
             error = damage
         except DataError:
-            if not self._container.is_beheaded():
+            if not (named_of(self._result.file) or self._container.is_beheaded()):
                 raise
             error = Damaged(self._container.path, 0, "the first bytes are not those of an MCAP file")
         if not self._contents.channels and error is None:

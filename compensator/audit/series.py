@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
@@ -19,10 +18,8 @@ from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.errors import DataError, UsageError
 from compensator.recording.chain import NOTHING
 from compensator.recording.head import read_head
-from compensator.recording.naming import order_of
+from compensator.recording.naming import named_of, order_of
 from compensator.recording.signature import Verifier
-
-_NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3,4})?\.mcap$")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,8 +124,8 @@ def audit(
 ) -> Audit:
     """Audit recordings.
 
-    What lies among recordings and is no file, such as a pipe, is a finding: it may stand where a recording was, and the
-    others can still be audited.
+    What lies among recordings and is no file, such as a pipe, or has the name of a recording and is none, is a finding:
+    it may stand where a recording was, and the others can still be audited.
 
     Parameters
     ----------
@@ -146,7 +143,7 @@ def audit(
     Raises
     ------
     DataError
-        If a file is not a recording, or none of them is a file.
+        If a file is not a recording and is not named as one, or none of them is a file.
     UsageError
         If the key or the head cannot be used.
     """
@@ -207,18 +204,19 @@ def _audited(
 
 
 def _or_finding(path: Path, found: RecordingAudit | DataError) -> RecordingAudit:
-    """Return the audit of a file; of a folder, link without a file, pipe or device one with that as its finding.
+    """Return the audit of a file; of what stands where a recording may have been, one with that as its finding.
 
     Raises
     ------
     DataError
-        If there is nothing, or a file that no service wrote: this is a mistake, no evidence.
+        If there is nothing, or a file that no service wrote and that does not have the name of a recording either:
+        this is a mistake, no evidence.
     """
     if isinstance(found, RecordingAudit):
         return found
-    if path.is_file() or not os.path.lexists(path):
+    if not os.path.lexists(path) or (path.is_file() and not named_of(path.name)):
         raise found
-    words = str(found).removeprefix(f"{path}: ")
+    words = str(found).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
     entry = RecordingAudit(file=path.name, original=path.name, end=AuditFinding.DAMAGED, is_recording=False)
     entry.find(Fault.NO_RECORDING, what=words)
     return entry
@@ -271,8 +269,7 @@ def combine(
 
 def _named(file: RecordingAudit) -> RecordingAudit:
     """Return the file with the machine of its file name if its metadata are lost."""
-    name = _NAME.match(file.file)
-    return file if name is None or file.machine else replace(file, machine=name["machine"])
+    return file if file.machine else replace(file, machine=named_of(file.file))
 
 
 def _started(original: str) -> tuple[str, int]:
@@ -303,7 +300,7 @@ class _Series:
     def check_file(self, file: RecordingAudit) -> None:
         """Check one file by itself."""
         name, remark = file.file, self.remarks.append
-        if file.original != name and _NAME.match(name):
+        if file.original != name and named_of(name):
             self._find(Fault.RENAMED, file, original=file.original)
         created = file.machine, file.original
         if created in self._first_of:

@@ -10,11 +10,11 @@ from pathlib import Path
 from compensator.clock import NS
 
 _STAMP = "%Y%m%dT%H%M%SZ"
-_REST = re.compile(r"_[0-9]{8}T[0-9]{6}Z(-[0-9]{3,4})?\.mcap")
+_NAME = re.compile(r"(?P<of>.+)_[0-9]{8}T[0-9]{6}Z(-[0-9]{3,4})?\.mcap")
 
 
 def day_of(time_utc_ns: int) -> str:
-    """Return the UTC day of a time; a file contains one day.
+    """Return the UTC day of a time; a file contains one day, or a part of it.
 
     Examples
     --------
@@ -70,13 +70,25 @@ def is_name(path: Path, of: str) -> bool:
     >>> [is_name(Path(f"m_{rest}.mcap"), "m") for rest in ("20260105T060000Z-copy", "00000000T000000Z")]
     [False, False]
     """
-    if _REST.fullmatch(path.name[len(of) :]) is None:
+    if named_of(path.name) != of:
         return False
     try:
         began_ns(path, of)
     except ValueError:
         return False
     return True
+
+
+def named_of(name: str) -> str:
+    """Return the machine, or `shop`, in the name of a recording; empty for another name.
+
+    Examples
+    --------
+    >>> named_of("vmc_07_20260105T060000Z-002.mcap"), named_of("copy.mcap")
+    ('vmc_07', '')
+    """
+    found = _NAME.fullmatch(name)
+    return found["of"] if found is not None else ""
 
 
 def began_ns(path: Path, of: str) -> int:

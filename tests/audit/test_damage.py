@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zstandard
+from mcap.writer import Writer
 
 from compensator.audit.series import Audit, audit, summary
 from compensator.cli import main
@@ -95,8 +97,62 @@ def test_the_command_gives_3_and_audits_the_others(
     assert main(["replay", *map(str, paths)]) == 3
     shown = capsys.readouterr().out
     assert f"{name}: damaged: byte {at}" in shown and "12 samples" in shown
-    paths[0].write_bytes(b"t_s,y_um\n0,1\n")
-    assert main(["replay", *map(str, paths)]) == 2
+    # What has neither the name nor the bytes of a recording is a mistake.
+    table = tmp_path / "table.csv"
+    table.write_bytes(b"t_s,y_um\n0,1\n")
+    assert main(["replay", *map(str, paths), str(table)]) == 2
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The newest file of a service that runs on."""
+    live = Service(tmp_path_factory.mktemp("live"), seq=18).run(6)
+    path = live.recorder.path
+    assert path is not None
+    live.kill()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("length", [1, 4, 8, 100, 4096, 10**6])
+@pytest.mark.parametrize("other", [b"\0", b"t_s,y_um\n0,1\n"])
+@pytest.mark.parametrize("alone", [False, True])
+def test_the_beginning_of_the_newest_file(
+    tmp_path: Path,
+    made: list[tuple[str, bytes]],
+    unfinished: bytes,
+    length: int,
+    other: bytes,
+    alone: bool,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Nothing at its end shows that it was a recording, but its name does."""
+    if not alone:
+        placed(tmp_path, made, -1, b"")
+    path = tmp_path / f"{MACHINE}_20260105T061800Z.mcap"
+    length = min(length, len(unfinished))
+    path.write_bytes((other * length)[:length] + unfinished[length:])
+    assert main(["replay", str(tmp_path)]) == 3
+    shown = capsys.readouterr().out
+    assert f"{path.name}: damaged: byte 0: " in shown and f"{0 if alone else 18} samples" in shown
+
+
+@pytest.mark.parametrize("data", [b"\0" * 7, b"\0" * 10**5, b"7 bytes", MAGIC + b"\x01" + bytes(7), b"a shop's"])
+def test_a_file_with_the_name_of_a_recording_does_not_prevent_the_audit_of_the_others(
+    tmp_path: Path, made: list[tuple[str, bytes]], data: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    placed(tmp_path, made, -1, b"")
+    path = tmp_path / f"{MACHINE}_20270101T000000Z.mcap"
+    path.write_bytes(data)
+    if data == b"a shop's":
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            writer.add_message(writer.register_channel("/shop/vmc-07/thermal/sample", "json", 0), 0, b"{}", 0)
+            writer.finish()
+        assert main(["replay", str(path)]) == 2  # by itself it is a mistake
+    assert main(["replay", str(tmp_path)]) == (0 if data.startswith(MAGIC) else 3)
+    shown = capsys.readouterr().out
+    assert path.name in shown and "18 samples" in shown
 
 
 @pytest.mark.parametrize("what", ["folder", "loop", "nothing", "pipe", "device"])
@@ -200,6 +256,37 @@ def test_a_schema_that_no_channel_has(tmp_path: Path) -> None:
     path.write_bytes(data[: at + length] + extra + data[at + length :])
     found = audit([path])
     assert found.clean and "outside_chain" in _codes(found) and "ghost" in " ".join(found.remarks)
+
+
+@pytest.mark.parametrize("place", ["first", "second", "middle", "last"])
+@pytest.mark.parametrize("count", [1, 50])
+def test_a_header_that_is_not_the_first_record_is_found(
+    tmp_path: Path, unfinished: bytes, place: str, count: int
+) -> None:
+    path = tmp_path / f"{MACHINE}_20260105T061800Z.mcap"
+    there = records(unfinished)
+    code, at, length = there[0]
+    assert code == HEADER
+    before = {"first": 0, "second": 1, "middle": len(there) // 2, "last": len(there) - 1}[place]
+    where = there[before][1]
+    path.write_bytes(unfinished[:where] + unfinished[at : at + length] * count + unfinished[where:])
+    found = audit([path])
+    assert found.findings_count == count and found.samples == 6, summary(found)
+    assert f"{path.name}: inserted: a header: is not at the start of the file" in found.findings[0].line()
+
+
+def test_bytes_behind_the_content_of_a_chunk(tmp_path: Path, made: list[tuple[str, bytes]]) -> None:
+    """A reader would not see them, and no CRC of the content covers them."""
+    for extra in (b"approved", zstandard.ZstdCompressor().compress(b"approved")):
+        data = made[1][1]
+        at, length = first_chunk(data)
+        body = bytearray(data[at + 9 : at + length])
+        place = 8 + 8 + 8 + 4 + 4 + len("zstd")
+        (size,) = struct.unpack_from("<Q", body, place)
+        struct.pack_into("<Q", body, place, size + len(extra))
+        chunk = struct.pack("<BQ", CHUNK, len(body) + len(extra)) + body + extra
+        found = audit(placed(tmp_path, made, 1, data[:at] + chunk + data[at + length :]))
+        assert f"damaged: byte {at}: a chunk that cannot be uncompressed" in summary(found)
 
 
 @pytest.mark.parametrize("topic", ["/offset", "/sneaky", ""])
