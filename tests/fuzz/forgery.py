@@ -7,8 +7,10 @@ deceived about a record that a signature or the head covers.
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
+import struct
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -17,6 +19,8 @@ from pathlib import Path
 
 from compensator.audit.series import Audit, audit
 from compensator.errors import DataError
+from compensator.recording.container import LARGEST, MAGIC
+from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, HEADER, MESSAGE_INDEX, METADATA, SCHEMA
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 from tests.audit.attacks import rechained, unsigned_seals, without_seals
@@ -27,7 +31,7 @@ from tests.fuzz.mutation import mutated
 
 #: Minutes that the recorded service ran each time; it was stopped, and then killed, once right after an hourly seal.
 RUNS = (65, 20, 61, 70)
-_NONE_LEFT = "no file is left"
+_NONE_LEFT = "no file with a record is left"
 
 
 def records(path: Path) -> list[Line]:
@@ -95,8 +99,11 @@ def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
         Whether the head was known, to the audit or to the service at its next start.
     """
     there = {path.name: path for path in recordings(folder / "rec", MACHINE)}
+    for name, path in there.items():
+        if path.stat().st_size > LARGEST:
+            return f"{name}: {path.stat().st_size} bytes, which no service writes"
     kept = [name for name in originals.names if name in there]
-    if not kept:
+    if not any(there[name].stat().st_size for name in kept):
         return _NONE_LEFT if head else ""
     first, last = originals.names.index(kept[0]), originals.names.index(kept[-1])
     if kept != originals.names[first : last + 1]:
@@ -110,7 +117,33 @@ def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
         count = originals.written(name) if head else originals.signed(name, found)
         if found[:count] != originals.records[name][:count]:
             return f"{name}: one of the first {count} records"
+    return next((f"{path.name}: {twice} in two places" for path in there.values() if (twice := _twice(path))), "")
+
+
+def _twice(path: Path) -> str:
+    """Return what else than messages and their index is more than once in a file."""
+    data, seen = path.read_bytes(), set[bytes]()
+    for code, at, length in parts(data):
+        if code in (CHUNK, DATA_END):
+            break
+        named = b"" if code == HEADER else data[at + 9 : at + length]
+        key = bytes([code]) + named
+        if code in (HEADER, SCHEMA, METADATA, ATTACHMENT) and key in seen:
+            return f"a record of kind {code}"
+        seen.add(key)
     return ""
+
+
+def parts(data: bytes) -> list[tuple[int, int, int]]:
+    """Kind, place and length with its head of each record of a file, as far as it is one."""
+    at, found = len(MAGIC), []
+    while at + 9 <= len(data) and data.startswith(MAGIC):
+        code, length = struct.unpack_from("<BQ", data, at)
+        if at + 9 + length > len(data):
+            break
+        found.append((code, at, 9 + length))
+        at += 9 + length
+    return found
 
 
 # ---------------------------------------------------------------------- what a forger does
@@ -220,6 +253,69 @@ def _emptied(rng: random.Random, paths: list[Path]) -> None:
     path.touch()
 
 
+def _seal(rng: random.Random, paths: list[Path]) -> None:
+    """Change of the last seal that remains what its signature does not cover, and perhaps remove those after it."""
+    path = rng.choice((paths[-1], rng.choice(paths)))
+    later = rng.choice((-60, 1, 30, 60, 1440)) * 60 * 10**9
+    texts = (b',"note":"approved"}', b" }", b',"reason":"stop"}')
+    way, text, removed = rng.randrange(3), rng.choice(texts), rng.random() < 0.7
+
+    def change(lines: list[Line]) -> list[Line]:
+        seals = [i for i, line in enumerate(lines) if line.topic == "seal"]
+        if removed and len(seals) > 1:
+            last = seals.pop()
+            lines = [*lines[:last], *lines[last + 2 :]]
+        if not seals:
+            return lines
+        seal = lines[seals[-1]]
+        if way < 2:
+            seal = replace(seal, time_ns=seal.time_ns + later)
+        if way > 0:
+            seal = replace(seal, data=seal.data[:-1] + text)
+        return [*lines[: seals[-1]], seal, *lines[seals[-1] + 1 :]]
+
+    rechained(path, change, finished=rng.random() < 0.3, cut=rng.choice((0, 0, 100)))
+
+
+def _added(rng: random.Random, paths: list[Path]) -> None:
+    """Put records that are no messages where none belong: copies of those at the start, or an index."""
+    path = rng.choice((paths[-1], rng.choice(paths)))
+    data = path.read_bytes()
+    there = parts(data)
+    copied = [one for one in there if one[0] in (HEADER, SCHEMA, METADATA, ATTACHMENT)]
+    if not copied:
+        return
+    _, at, length = rng.choice((copied[0], rng.choice(copied)))
+    extra = data[at : at + length]
+    if rng.random() < 0.2:
+        body = struct.pack("<HI", 1, 16) + rng.randbytes(16)
+        extra += struct.pack("<BQ", MESSAGE_INDEX, len(body)) + body
+    where = rng.choice(there)[1]
+    path.write_bytes(data[:where] + extra * rng.choice((1, 1, 50)) + data[where:])
+
+
+def _large(rng: random.Random, paths: list[Path]) -> None:
+    """A file of zeros, or zeros behind a recording, which take no space on the disk."""
+    size = rng.choice((LARGEST + 1, 4 * 10**9, 10**11))
+    if rng.random() < 0.5:
+        os.truncate(rng.choice(paths), size)
+    else:
+        path = paths[0].with_name(f"{MACHINE}_{rng.choice((2025, 2027))}0101T000000Z.mcap")
+        path.write_bytes(rng.choice((MAGIC, b"")))
+        os.truncate(path, size)
+
+
+def _begun(rng: random.Random, paths: list[Path]) -> None:
+    """Overwrite the beginning of a file, or put one there that has nothing of a recording but its name."""
+    path = rng.choice((paths[-1], rng.choice(paths)))
+    length = rng.choice((1, 4, 7, 8, 100, 4096))
+    other = rng.choice((bytes(length), rng.randbytes(length), b"0,20.5\n" * length))[:length]
+    if rng.random() < 0.3:
+        path.with_name(f"{MACHINE}_20270101T000000Z.mcap").write_bytes(other)
+    else:
+        path.write_bytes(other + path.read_bytes()[length:])
+
+
 ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
     "rewritten": _rewritten,
     "rewritten again": _rewritten,
@@ -228,6 +324,10 @@ ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
     "exchanged": _exchanged,
     "inserted": _inserted,
     "emptied": _emptied,
+    "seal": _seal,
+    "added": _added,
+    "large": _large,
+    "begun": _begun,
 }
 
 
@@ -256,8 +356,8 @@ def attacked(originals: Originals, folder: Path, seed: int) -> Tried:
     shutil.copytree(originals.folder / "rec", folder / "rec")
     shutil.copy(originals.folder / "vmc-07.head.json", folder)
     kinds = rng.sample(list(ATTACKS), 2 if rng.random() < 0.5 else 1)
-    # What is read by an attack must hold records.
-    kinds.sort(key=lambda kind: kind == "emptied")
+    # What is read by an attack must hold records, and be no larger than they are.
+    kinds.sort(key=lambda kind: kind in ("emptied", "large"))
     before, tried = recordings(folder / "rec", MACHINE), list[str]()
     for one in kinds:
         paths = before if one == "emptied" else recordings(folder / "rec", MACHINE)
@@ -284,11 +384,13 @@ def attacked(originals: Originals, folder: Path, seed: int) -> Tried:
 
 
 def _verdict(originals: Originals, folder: Path, *, head: bool) -> Audit | None:
-    """Audit the folder; None if it is refused in one line."""
+    """Audit the folder; None if it is refused in one line, which it is not beside a file that nobody has changed."""
     paths = recordings(folder / "rec", MACHINE)
     known = folder / "vmc-07.head.json" if head else None
     try:
         return audit(paths, public_key=originals.public, head=known) if paths else None
     except DataError as error:
         assert "\n" not in str(error)
+        kept = [path for path in paths if path.name in originals.names and path.stat().st_size < LARGEST]
+        assert not any(path.read_bytes() == (originals.folder / "rec" / path.name).read_bytes() for path in kept)
         return None

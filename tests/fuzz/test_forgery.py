@@ -9,7 +9,7 @@ import pytest
 
 from tests.fuzz.forgery import ATTACKS, Originals, attacked, deceived
 
-SEEDS = range(48)
+SEEDS = range(72)
 
 
 @pytest.fixture(scope="module")
