@@ -121,11 +121,12 @@ def audit(
     head: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
+    named: Collection[Path] = (),
 ) -> Audit:
     """Audit recordings.
 
-    What lies among recordings and is no file, such as a pipe, or has the name of a recording and is none, is a finding:
-    it may stand where a recording was, and the others can still be audited.
+    What lies among recordings and is none is a finding: it may stand where a recording was, and the others can still be
+    audited. A file that somebody has named is his mistake, unless its own name is that of a recording.
 
     Parameters
     ----------
@@ -139,11 +140,13 @@ def audit(
         Called with the number of bytes processed and their total.
     executor : Executor, optional
         Audits the files in parallel; without one, this process audits them one after the other.
+    named : collection of pathlib.Path
+        Those of the paths that were named one by one, not found in a folder.
 
     Raises
     ------
     DataError
-        If a file is not a recording and is not named as one, or none of them is a file.
+        If none of the files is a recording, or one that was named is none and does not have the name of one.
     UsageError
         If the key or the head cannot be used.
     """
@@ -167,7 +170,7 @@ def audit(
         audits = _side_by_side(executor, paths, public_key, heads, lambda path: add(sizes[path]))
     else:
         audits = [_audited(path, verifier, heads.get(path.name, frozenset()), progress=add) for path in paths]
-    whole = [_or_finding(path, one) for path, one in zip(paths, audits, strict=True)]
+    whole = [_or_finding(path, one, is_named=path in named) for path, one in zip(paths, audits, strict=True)]
     for one in audits:
         if isinstance(one, DataError) and not any(file.is_recording for file in whole):
             raise one
@@ -203,18 +206,18 @@ def _audited(
         return error
 
 
-def _or_finding(path: Path, found: RecordingAudit | DataError) -> RecordingAudit:
+def _or_finding(path: Path, found: RecordingAudit | DataError, *, is_named: bool) -> RecordingAudit:
     """Return the audit of a file; of what stands where a recording may have been, one with that as its finding.
 
     Raises
     ------
     DataError
-        If there is nothing, or a file that no service wrote and that does not have the name of a recording either:
-        this is a mistake, no evidence.
+        If there is nothing, or a file that was named, that no service wrote and that does not have the name of a
+        recording either: this is a mistake, no evidence.
     """
     if isinstance(found, RecordingAudit):
         return found
-    if not os.path.lexists(path) or (path.is_file() and not named_of(path.name)):
+    if not os.path.lexists(path) or (path.is_file() and is_named and not named_of(path.name)):
         raise found
     words = str(found).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
     entry = RecordingAudit(file=path.name, original=path.name, end=AuditFinding.DAMAGED, is_recording=False)

@@ -48,9 +48,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
         paths, public_key = [path.absolute() for path in paths], public_key and resolved(public_key)
+    named = {path.absolute() if arguments.scheduler is not None else path for path in arguments.recording}
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:
-        found = audit(paths, public_key=public_key, head=head, progress=progress, executor=executor)
+        found = audit(paths, public_key=public_key, head=head, progress=progress, executor=executor, named=named)
     answer = Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
     if page is None:
         return answer

@@ -164,9 +164,13 @@ def test_a_file_that_no_service_wrote_is_no_clean_recording(
         schema = writer.register_schema("x", "jsonschema", b"{}")
         writer.add_message(writer.register_channel(topic, "json", schema), 0, b"{}", 0)
         writer.finish()
-    assert main(["replay", str(rec.parent)]) == 2
+    assert main(["replay", str(rec.parent)]) == 3  # somebody has put it there; the others are audited
     said = capsys.readouterr()
-    assert not said.out and said.err.count("\n") == 1 and f"foreign.mcap: {expected}" in said.err
+    assert f"foreign.mcap: damaged: not read: {expected}" in said.out and "30 samples" in said.out
+    for named in ([str(rec), str(foreign)], [str(foreign)]):
+        assert main(["replay", *named]) == 2
+        said = capsys.readouterr()
+        assert not said.out and said.err.count("\n") == 1 and f"foreign.mcap: {expected}" in said.err
     for other in (["replay", str(foreign), "--model", "quill"], ["report", str(foreign), "--out", f"{foreign}.html"]):
         assert main(other) == 2
         assert "foreign.mcap: no samples" in capsys.readouterr().err
