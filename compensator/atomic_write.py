@@ -21,8 +21,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     Parameters
     ----------
     path : pathlib.Path
-        The file; its folder must exist. An existing file remains until it is replaced. A link remains a link, and a
-        target that is not a regular file (`/dev/null`, a pipe) is written directly.
+        The file; its folder must exist. An existing file remains until it is replaced. A link remains a link.
 
     Yields
     ------
@@ -33,6 +32,8 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     ------
     UsageError
         If the folder does not exist.
+    OSError
+        If the target is a device, a pipe or a folder; it is kept.
 
     Examples
     --------
@@ -45,10 +46,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     """
     path = resolved(path)
     require_folder(path)
-    if path.exists() and not path.is_file():
-        with path.open("w", newline="", encoding="utf-8") as file:
-            yield file
-        return
+    _require_regular(path)
     with (
         _replacement(path, 0o600) as descriptor,
         os.fdopen(descriptor, "w", newline="", encoding="utf-8") as file,
@@ -72,6 +70,12 @@ def require_folder(path: Path) -> None:
         raise UsageError(f"{path}: no such folder")
 
 
+def _require_regular(path: Path) -> None:
+    """Refuse to replace a device, a pipe or a folder."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
 def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True) -> None:
     """Replace a file; a link is replaced, not followed.
 
@@ -91,8 +95,8 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
     OSError
         If it cannot be written, or is a device, a pipe or a folder; what is there is kept.
     """
-    if path.exists() and not (path.is_symlink() or path.is_file()):
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    if not path.is_symlink():
+        _require_regular(path)
     with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
         file.write(data)
         if sync:

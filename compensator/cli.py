@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
+from compensator.commands.outputs import check_outputs
 from compensator.commands.stopping import stoppable
 from compensator.commands.wrapping import styled, wrapped
 from compensator.errors import CompensatorError
@@ -156,6 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(stream=sys.stderr, format="%(message)s", force=True)
     log.setLevel(logging.INFO)  # what libraries tell is of no use to an operator, what they warn of is
     try:
+        check_outputs(given)
         answer = load(given.command)(given)
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:

@@ -6,6 +6,19 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from compensator.commands.outputs import (
+    Reads,
+    Writes,
+    files_of_diagnosis,
+    page_of_calibration,
+    page_of_report,
+    pages_of_demo,
+)
+
+#: A file that is read, or a folder of recordings; a file, or the name of a model.
+_READ, _READ_TEXT = Reads(), Reads(str)
+#: A table, a page, a folder.
+_TABLE, _PAGE_FILE, _FOLDER = Writes(".csv"), Writes(".html"), Writes("")
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
 _SCHEDULER = "run on this Dask scheduler, such as tcp://host:8786 (default: all cores of this computer)"
 
@@ -28,7 +41,7 @@ def _y_std(parser: argparse.ArgumentParser) -> None:
 def _page(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page",
-        type=Path,
+        type=_PAGE_FILE,
         metavar="FILE",
         help="also write the page to this file: .html, or .pdf or .png (printed by an installed browser)",
     )
@@ -49,7 +62,7 @@ def _number(low: float, high: float) -> Callable[[str], float]:
 def demo(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `demo`."""
     add = parser.add_argument
-    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
+    add("--out", type=Writes("", pages_of_demo), default=Path("demo-out"), metavar="DIR", help="folder for the results")
     add("--hours", type=_number(0.1, 10_000.0), default=24.0, help="length of the simulated run, h (default 24)")
     add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
     add(
@@ -65,7 +78,7 @@ def demo(parser: argparse.ArgumentParser) -> None:
 
 def run(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `run` and `probe`; `adopt` and `back` have it as well."""
-    parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
+    parser.add_argument("--config", type=_READ_TEXT, required=True, metavar="FILE", help="configuration of the service")
 
 
 probe = run
@@ -75,7 +88,7 @@ def check(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `check`."""
     run(parser)
     words = "check whether the service could run this model (a file, or quill) in place of its own"
-    parser.add_argument("--model", metavar="MODEL", help=words)
+    parser.add_argument("--model", type=_READ_TEXT, metavar="MODEL", help=words)
 
 
 def simulate(parser: argparse.ArgumentParser) -> None:
@@ -83,13 +96,13 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "data",
-        type=Path,
+        type=_READ,
         nargs="+",
         metavar="DATA",
         help="CSV or MAT file, or recording; several files are several runs",
     )
-    add("--model", required=True, help="a model file, or quill")
-    add("--out", type=Path, required=True, metavar="CSV")
+    add("--model", type=_READ_TEXT, required=True, help="a model file, or quill")
+    add("--out", type=_TABLE, required=True, metavar="CSV")
     words = "correct each row by the measured Y of earlier rows, as the service does by probes (default: run free)"
     add("--correct", action="store_true", help=words)
     _y_std(parser)
@@ -100,12 +113,12 @@ def simulate(parser: argparse.ArgumentParser) -> None:
 def compare(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `compare`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="one or more tables (CSV, MAT), or recordings, with Y")
+    add("data", type=_READ, nargs="+", metavar="DATA", help="one or more tables (CSV, MAT), or recordings, with Y")
     words = "a model file, or quill; repeated for each model"
-    add("--model", action="append", required=True, metavar="MODEL", help=words)
+    add("--model", type=_READ_TEXT, action="append", required=True, metavar="MODEL", help=words)
     words = "compare from this hour of each file on; the models run from its start (0)"
     add("--from", dest="from_h", type=_number(0.0, 1e6), default=0.0, metavar="H", help=words)
-    add("--out", type=Path, metavar="CSV", help="also write measured Y, predictions and residuals as a table")
+    add("--out", type=_TABLE, metavar="CSV", help="also write measured Y, predictions and residuals as a table")
     _page(parser)
     _column(parser)
     _axis(parser)
@@ -115,7 +128,7 @@ def loop(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `loop`."""
     add = parser.add_argument
     words = "recordings of a machine, or a folder that contains such folders"
-    add("folder", type=Path, nargs="+", metavar="FOLDER", help=words)
+    add("folder", type=_READ, nargs="+", metavar="FOLDER", help=words)
     words = "without [loop] in the configuration of a machine: propose or adopt a better model (default adopt)"
     add("--policy", choices=("propose", "adopt"), default="adopt", help=words)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
@@ -125,8 +138,8 @@ def loop(parser: argparse.ArgumentParser) -> None:
 def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
     words = "recordings of one machine in any order, or a folder of them"
-    parser.add_argument("recording", type=Path, nargs="+", metavar="FILE.mcap", help=words)
-    parser.add_argument("--out", type=Path, required=True, metavar="CSV")
+    parser.add_argument("recording", type=_READ, nargs="+", metavar="FILE.mcap", help=words)
+    parser.add_argument("--out", type=_TABLE, required=True, metavar="CSV")
     words = "machine in a shop's recording (watch --record), such as shop/vmc-07"
     parser.add_argument("--machine", default="", metavar="PREFIX", help=words)
 
@@ -136,7 +149,7 @@ def bridge(parser: argparse.ArgumentParser) -> None:
     words = "opcua: send the offset to a control; probes: send values of touch probes to the service"
     parser.add_argument("protocol", choices=("opcua", "probes"), help=words)
     words = "TOML with [receiver] and [opcua], or with [probes] and its sources"
-    parser.add_argument("--config", required=True, metavar="FILE", help=words)
+    parser.add_argument("--config", type=_READ_TEXT, required=True, metavar="FILE", help=words)
     parser.add_argument("--check", action="store_true", help="check the file without opening a connection")
 
 
@@ -155,8 +168,9 @@ def explain(parser: argparse.ArgumentParser) -> None:
 def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
-    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; its page is written next to it")
+    add("data", type=_READ, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
+    words = "the model file; its page is written next to it"
+    add("--out", type=Writes(".toml", page_of_calibration), required=True, metavar="MODEL", help=words)
     _page(parser)
     _column(parser)
     _axis(parser)
@@ -176,24 +190,24 @@ def identify(parser: argparse.ArgumentParser) -> None:
     words = "method I: gain and time constant of the first-order TDTF"
     add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
     words = "methods II and III: a run with the heat source off; may be repeated"
-    add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
+    add("--etve", type=_READ, action="append", default=[], metavar="DATA", help=words)
     add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the final part, h (6)")
     add = parser.add_argument_group("validation").add_argument
     words = "a run used only for validation; may be repeated"
-    add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
+    add("--validate", type=_READ, action="append", default=[], metavar="DATA", help=words)
     add("--fit-until", type=float, metavar="H", help="fit up to this hour, validate on the rest")
     add("--folds", type=int, default=5, help="number of held-out blocks of time (5)")
-    add("--reference", metavar="MODEL", help="another model, to compare its coefficients")
+    add("--reference", type=_READ_TEXT, metavar="MODEL", help="another model, to compare its coefficients")
 
 
 def diagnose(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `diagnose`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
-    add("--model", required=True, help="a model file, or quill")
+    add("data", type=_READ, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
+    add("--model", type=_READ_TEXT, required=True, help="a model file, or quill")
     add(
         "--out",
-        type=Path,
+        type=Writes("", files_of_diagnosis),
         required=True,
         metavar="DIR",
         help="folder for diagnosis.json, model.toml, report.html and series.csv",
@@ -201,7 +215,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     words = "search up to this hour, validate both models on the rest"
     add("--fit-until", type=_number(0.0, 1e6), metavar="H", help=words)
     words = "data that take no part in the search, to validate both models; may be repeated"
-    add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
+    add("--validate", type=_READ, action="append", default=[], metavar="DATA", help=words)
     words = "keep the paths of the model even where it misses much of its own calibration, as the loop does"
     add("--keep-paths", action="store_true", help=words)
     _page(parser)
@@ -214,11 +228,16 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
 def replay(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `replay`."""
     add = parser.add_argument
-    add("recording", type=Path, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
-    add("--public-key", type=Path, metavar="FILE", help="Ed25519 public key (PEM) to check the signatures")
-    add("--head", type=Path, metavar="FILE", help="with --public-key: head of the chain, which the machine keeps")
-    add("--model", metavar="OTHER", help="show what this model (a file, or quill) would have done, without an audit")
-    add("--out", type=Path, metavar="CSV", help="with --model: table of both offsets for every sample")
+    add("recording", type=_READ, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
+    add("--public-key", type=_READ, metavar="FILE", help="Ed25519 public key (PEM) to check the signatures")
+    add("--head", type=_READ, metavar="FILE", help="with --public-key: head of the chain, which the machine keeps")
+    add(
+        "--model",
+        type=_READ_TEXT,
+        metavar="OTHER",
+        help="show what this model (a file, or quill) would have done, without an audit",
+    )
+    add("--out", type=_TABLE, metavar="CSV", help="with --model: table of both offsets for every sample")
     _page(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
@@ -227,15 +246,15 @@ def report(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `report`."""
     add = parser.add_argument
     words = "recordings, a folder of them, or a folder with results of demo, identify or diagnose"
-    add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
+    add("what", type=_READ, nargs="+", metavar="DIR_OR_FILE", help=words)
     words = "the page: .html, or .pdf or .png (first figure only) printed by an installed browser "
     words += "(default: NAME-report.html in the current folder)"
-    add("--out", type=Path, metavar="FILE", help=words)
+    add("--out", type=Writes(".html", default=page_of_report), metavar="FILE", help=words)
 
 
 def adopt(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `adopt`."""
-    parser.add_argument("model", nargs="?", metavar="MODEL", help="a model file, or quill")
+    parser.add_argument("model", type=_READ_TEXT, nargs="?", metavar="MODEL", help="a model file, or quill")
     parser.add_argument("--candidate", action="store_true", help="adopt the model that the service proposes ([loop])")
     back(parser)
 
@@ -244,7 +263,7 @@ def dismiss(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `dismiss`."""
     run(parser)
     add = parser.add_argument
-    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
+    add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
     add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
 
 
@@ -252,7 +271,7 @@ def back(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `back`; `adopt` has them as well."""
     run(parser)
     add = parser.add_argument
-    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
+    add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
     words = (
         "adopt the model even if measured Y shows that it is clearly worse, or the recordings do not determine its "
         "state; its standard deviation is then larger"
@@ -264,9 +283,14 @@ def back(parser: argparse.ArgumentParser) -> None:
 def hold(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `hold` and `resume`; `zero` has them as well."""
     add = parser.add_argument
-    add("--config", metavar="FILE", help="configuration of the service; without it, --prefix and --zenoh")
+    add(
+        "--config",
+        type=_READ_TEXT,
+        metavar="FILE",
+        help="configuration of the service; without it, --prefix and --zenoh",
+    )
     add("--prefix", metavar="PREFIX", help="zenoh.prefix of the machine, such as shop/vmc-07")
-    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
+    add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
     add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
 
 
@@ -283,7 +307,7 @@ def zero(parser: argparse.ArgumentParser) -> None:
 def router(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `router`."""
     add = parser.add_argument
-    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh configuration, as for zenohd")
+    add("--config", required=True, type=_READ, metavar="FILE", help="Zenoh configuration, as for zenohd")
     add("--check", action="store_true", help="check the configuration without opening a port")
     words = "write Zenoh's log to stdout; warn shows why a link is refused"
     add("--log", choices=("error", "warn", "info", "debug"), help=words)
@@ -293,11 +317,11 @@ def watch(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `watch`."""
     add = parser.add_argument
     words = "watch the service of this configuration, including the last day from its recordings"
-    add("--config", metavar="FILE", help=words)
+    add("--config", type=_READ_TEXT, metavar="FILE", help=words)
     words = "connect to this endpoint, such as tcp/127.0.0.1:7447; may be repeated, the first that answers is used"
     add("--connect", action="append", default=[], metavar="ENDPOINT", help=words)
     words = "Zenoh configuration with a receiver's or operator's certificate, such as receiver.json5; needed over TLS"
-    add("--zenoh", type=Path, metavar="FILE", help=words)
+    add("--zenoh", type=_READ, metavar="FILE", help=words)
     words = "watch this machine, or all machines below this prefix (default: that of the configuration, or everything)"
     add("--prefix", help=words)
     add("--once", action="store_true", help="show the state once and exit, as --json does")
@@ -308,9 +332,9 @@ def watch(parser: argparse.ArgumentParser) -> None:
     words += "at the machine; the printed address ends in a token, without which nothing is shown"
     add("--bind", metavar="ADDRESS", help=words)
     words = "with --bind: file with the token, made if it does not exist (default: a new token at each start)"
-    add("--token", type=Path, metavar="FILE", help=words)
+    add("--token", type=_READ, metavar="FILE", help=words)
     words = "record all messages of all machines as MCAP in this folder"
-    add("--record", type=Path, metavar="FOLDER", help=words)
+    add("--record", type=_FOLDER, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
     add("--foxglove-port", type=int, default=8765, metavar="PORT", help="port for Foxglove (8765)")
     words = "let pages of this origin connect to Foxglove's port, besides Foxglove itself; may be repeated"

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from compensator.api.comparison import compare
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file, checked_page, pages_text
+from compensator.commands.outputs import pages_text
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
 from compensator.model.model_file import load_axes
@@ -18,9 +17,6 @@ from compensator.model.thermal_model import ThermalModel
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
-    page = checked_page(given.page)
-    if given.out is not None:
-        checked_file(given.out, "--out", read=(*given.data, *map(Path, given.model)), ending=".csv")
     models = _by_name(given.model)
     columns = roles_of(given.column)
     found = compare(models, given.data, columns=columns, axis=given.axis, from_h=given.from_h)
@@ -29,9 +25,9 @@ def run(arguments: argparse.Namespace) -> Answer:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         found.save(given.out)
         result, text = result | {"out": str(given.out)}, f"{text}\n\ntable: {given.out}"
-    if page is not None:
-        found.write_page(page)
-        result, text = result | {"report": str(page)}, f"{text}\n{pages_text(page, None)}"
+    if given.page is not None:
+        found.write_page(given.page)
+        result, text = result | {"report": str(given.page)}, f"{text}\n{pages_text(given.page, None)}"
     return Answer(result, text)
 
 

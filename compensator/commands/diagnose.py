@@ -9,7 +9,7 @@ from pathlib import Path
 from compensator.api.diagnosis import FILES, DiagnosisResult, diagnose
 from compensator.api.files import models_of
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_folder, checked_page, pages_text
+from compensator.commands.outputs import pages_text
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.data.axes import AxisLike
@@ -24,7 +24,6 @@ ALONE = 30_000
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
-    page = checked_page(given.page)
     return diagnose_files(
         given.data,
         given.model,
@@ -36,7 +35,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         fit_until_h=given.fit_until,
         validate=given.validate,
         keep_paths=given.keep_paths,
-        also=page,
+        also=given.page,
     )
 
 
@@ -55,7 +54,6 @@ def diagnose_files(
     also: Path | None = None,
 ) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
-    checked_folder(out, "--out", read=(*data, *validate, Path(model)), names=FILES)
     bases = models_of(model)
     period_s = next(iter(bases.values())).period_s
     measured = measurements(data, "data", columns)

@@ -9,7 +9,7 @@ from compensator.api.identification import identify
 from compensator.api.identification_result import IdentificationResult
 from compensator.api.identified_axes import IdentifiedAxes
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file, checked_page, pages_text
+from compensator.commands.outputs import pages_text
 from compensator.commands.progress import progress_bar
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
@@ -22,10 +22,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     given = arguments
     if str(given.out) in BUILT_IN:
         raise UsageError(f"--out {given.out}: is the name of the published model, expected a name that ends in .toml")
-    reference = () if given.reference is None or given.reference in BUILT_IN else (Path(given.reference),)
-    read = (*given.data, *given.etve, *given.validate, *reference)
-    checked_file(given.out, "--out", read=read, ending=".toml")
-    page = checked_page(given.page)
     with progress_bar("fitting") as progress:
         found = identify(
             given.data,
@@ -47,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Answer:
             reference=given.reference,
             progress=progress,
         )
-    return write(found, given.out, also=page)
+    return write(found, given.out, also=given.page)
 
 
 def write(found: IdentificationResult | IdentifiedAxes, out: Path, *, also: Path | None = None) -> Answer:

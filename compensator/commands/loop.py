@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from compensator.blas import in_one_thread
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_page
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import DataError
@@ -29,7 +28,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     DataError
         If a folder is none, or no machine's recordings can be used.
     """
-    folders, page = _folders(arguments.folder), checked_page(arguments.page)
+    folders = _folders(arguments.folder)
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
         folders = [folder.resolve() for folder in folders]
@@ -37,7 +36,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         found = _each(folders, arguments.policy, progress, executor)
     if all(one.error for one in found):
         raise DataError(found[0].error)
-    return _answer(found, page)
+    return _answer(found, arguments.page)
 
 
 def _folders(given: Sequence[Path]) -> list[Path]:

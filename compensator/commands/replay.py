@@ -12,7 +12,6 @@ from compensator.atomic_write import atomic_write
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file, checked_page
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
@@ -31,14 +30,12 @@ ALONE = 8_000_000
 
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
-    paths, page = recordings_in(arguments.recording), checked_page(arguments.page)
+    paths, page = recordings_in(arguments.recording), arguments.page
     if arguments.model is not None:
         if arguments.public_key is not None:
             raise UsageError("--public-key: is for the audit, which is not made with --model")
         if arguments.head is not None:
             raise UsageError("--head: is for the audit, which is not made with --model")
-        if arguments.out is not None:
-            checked_file(arguments.out, "--out", read=(*paths, Path(arguments.model)), ending=".csv")
         return _compare(paths, arguments.model, arguments.out, page)
     if arguments.out is not None:
         raise UsageError("--out: is for --model, which is not given")

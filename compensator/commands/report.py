@@ -15,13 +15,11 @@ from compensator.input_file import resolved
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     from compensator.recording.reading import recordings_in
-    from compensator.report.formats import checked
 
     given: list[Path] = arguments.what
-    out = checked(arguments.out or Path(f"{_name(given[0])}-report.html"), option="--out")
     if len(given) == 1 and given[0].is_dir() and not any(given[0].glob("*.mcap")):
-        return _results(given[0], out)
-    return _recordings(recordings_in(given), out)
+        return _results(given[0], arguments.out)
+    return _recordings(recordings_in(given), arguments.out)
 
 
 def _recordings(paths: Sequence[Path], out: Path) -> Answer:
@@ -49,9 +47,3 @@ def _results(folder: Path, out: Path) -> Answer:
     }
     lines = [f"{page.path}\n  {page.verdict}" for page in pages]
     return Answer(result, "\n".join([*lines, f"page: {out}"]))
-
-
-def _name(path: Path) -> str:
-    """Return the name for the page, from the file or the folder."""
-    whole = resolved(path)
-    return whole.stem if whole.suffix == ".mcap" else whole.name or "all"

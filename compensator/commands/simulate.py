@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
-from pathlib import Path
 
 from compensator.api.simulation import simulate
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file
 from compensator.data.table import roles_of
 
 log = logging.getLogger("compensator")
@@ -17,12 +15,11 @@ log = logging.getLogger("compensator")
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
-    out = checked_file(given.out, "--out", read=(*given.data, Path(given.model)), ending=".csv")
     columns = roles_of(given.column)
     options = {"columns": columns, "axis": given.axis, "correct": given.correct, "y_std_um": given.y_std}
     found = simulate(given.model, given.data, **options)
     for remark in found.remarks:
         log.warning("%s", remark.marked)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    found.save(out)
-    return Answer(found.to_dict() | {"out": str(out)}, f"{found.summary()}\ntable: {out}")
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    found.save(given.out)
+    return Answer(found.to_dict() | {"out": str(given.out)}, f"{found.summary()}\ntable: {given.out}")

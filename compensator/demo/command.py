@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_page, pages_text
+from compensator.commands.outputs import pages_text
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import calibrate, paper_case
@@ -57,10 +57,9 @@ def _run(arguments: argparse.Namespace) -> Answer:
         recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
         text = f"stopped; to check the recordings: compensator replay {recordings}, compensator report {recordings}"
         return Answer({"recordings": str(recordings)}, text)
-    also = checked_page(arguments.page)
     if arguments.loop:
-        return Answer(*run_ten_days(arguments.out, seed=arguments.seed, also=also))
-    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
+        return Answer(*run_ten_days(arguments.out, seed=arguments.seed, also=arguments.page))
+    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=arguments.page))
 
 
 def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) -> tuple[dict[str, Any], str]:

@@ -16,9 +16,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from compensator.errors import CompensatorError, UsageError
-from compensator.input_file import resolved
+from compensator.input_file import open_file, resolved
 from compensator.report.local_time import today
-from compensator.report.page import Figure, Page, Row, html_of, write_page
+from compensator.report.page import GENERATOR, Figure, Page, Row, html_of, write_page
 
 SUFFIXES = (".html", ".pdf", ".png")
 #: Browsers that print from the command line, all of the Chromium family, in the order in which they are tried.
@@ -35,6 +35,13 @@ BROWSERS = (
 TIMEOUT_S = 60.0
 #: First bytes of what is printed.
 _SIGNATURES = {".pdf": b"%PDF-", ".png": b"\x89PNG\r\n"}
+#: What says that a page is ours, whatever its version, within its first bytes.
+_MARKS = {
+    ".html": b'<meta name="generator" content="quill-compensator ',
+    ".pdf": b"/Creator (quill-compensator ",
+    ".png": b"Software\0quill-compensator ",
+}
+_MARK_BYTES = 4096
 _OPTIONS = (
     "--headless",
     "--disable-gpu",
@@ -51,6 +58,8 @@ _OPTIONS = (
     "--disable-sync",
     "--disable-crash-reporter",
     "--disable-breakpad",
+    # Stands in a PDF as what made it.
+    f"--user-agent={GENERATOR}",
     # On paper and in a picture the light colours, whatever the desktop is set to.
     "--blink-settings=preferredColorScheme=1",
 )
@@ -71,7 +80,8 @@ def checked(path: Path, *, option: str) -> Path:
     Raises
     ------
     UsageError
-        If its suffix is not in `SUFFIXES`, its folder does not exist, or it needs a browser and none is installed.
+        If its suffix is not in `SUFFIXES`, its folder does not exist, it needs a browser and none is installed, or what
+        is there is no page.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{option} {path}: expected a name that ends in .html, .pdf or .png")
@@ -82,7 +92,32 @@ def checked(path: Path, *, option: str) -> Path:
             f"{option} {path}: no browser found for printing (Chromium, Chrome, Edge or Brave on PATH); "
             "expected a name that ends in .html, which any browser can print"
         )
+    check_replaced(path, option=option)
     return path
+
+
+def check_replaced(path: Path, *, option: str) -> None:
+    """Refuse to replace what is no page of this program; an empty file may become one.
+
+    Parameters
+    ----------
+    path, option
+        As :func:`checked`.
+
+    Raises
+    ------
+    UsageError
+        If there is such a file.
+    """
+    try:
+        with open_file(path) as file:
+            beginning = file.read(_MARK_BYTES)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UsageError(f"{option} {path}: {error.strerror}, expected the name of a file") from error
+    if beginning and _MARKS[path.suffix.lower()] not in beginning:
+        raise UsageError(f"{option} {path}: exists and is no page of this program, expected another name")
 
 
 def write(path: Path, page: Page) -> Path:
@@ -183,5 +218,5 @@ def _crop(path: Path) -> None:
 
     pixels = imread(path)
     used = np.flatnonzero((pixels != pixels[-1, -1]).any(axis=(1, 2)))
-    if used.size:
-        imsave(path, pixels[: used[-1] + 16 * _PNG_SCALE])
+    end = used[-1] + 16 * _PNG_SCALE if used.size else len(pixels)
+    imsave(path, pixels[:end], metadata={"Software": GENERATOR})

@@ -36,6 +36,8 @@ TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "
 MOST_NAMES = 3
 #: A command in a text, shown as the code that it is.
 _COMMAND = re.compile(r"`([^`]+)`")
+#: Who made a page, near its beginning in each format.
+GENERATOR = f"quill-compensator {__version__}"
 #: A page needs inline styles only, and the script by its hash.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
@@ -109,7 +111,8 @@ def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
     policy = f"{_POLICY}; script-src {script_hash()}" if zooms else _POLICY
     tone = f"<b>{TONE_WORDS[page.tone]}</b>" if page.tone else ""
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="generator" content="{GENERATOR}"><title>{title}</title>'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
         f'<main><h1>{title}</h1><p class="verdict {page.tone or "plain"}">{tone}'
@@ -139,7 +142,7 @@ def _names(files: Sequence[str]) -> str:
 
 def _origin(page: Page, date: str) -> str:
     """Return the last line: version, date, data."""
-    parts = [f"quill-compensator {__version__}", date, f"data: {_names(page.data)}" if page.data else ""]
+    parts = [GENERATOR, date, f"data: {_names(page.data)}" if page.data else ""]
     return f'<p class="note">{html.escape(", ".join(filter(None, parts)))}.</p>'
 
 
