@@ -32,7 +32,7 @@ from compensator.identify.calibration import Calibration, calibrate, of_machine
 from compensator.identify.comparison import compare
 from compensator.identify.criticism import criticise
 from compensator.identify.pairs import Pair, pairs
-from compensator.identify.settings import Method, Settings
+from compensator.identify.settings import LONGEST_H, Method, Settings
 from compensator.identify.shared_poles import calibrated_together
 from compensator.identify.summary import MODEL, figures
 from compensator.model.free_run import FreeRunErrors
@@ -130,6 +130,8 @@ def identify(
         etve_end_h=float(etve_end_h),
         folds=folds,
     )
+    if fit_until_h is not None and not 0.0 < fit_until_h <= LONGEST_H:
+        raise UsageError(f"fit until {fit_until_h:g} h: expected more than 0, at most {LONGEST_H:g}")
     if not is_one_line(name):
         raise UsageError(f"name = {shown(name)}, expected {ONE_LINE}")
     # A wrong file is refused before the fit, which may take minutes.

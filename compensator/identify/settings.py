@@ -13,6 +13,8 @@ Drive = Literal["ttf", "known"]
 
 #: Largest order of a path, and number of held-out blocks: each block is a fit.
 LARGEST_ORDER, MOST_FOLDS = 8, 100
+#: What a given TDTF can have, of whichever sign: gain, µm/K, and time constant, min; longest record, h.
+LARGEST_GAIN_UM_PER_K, TIME_CONSTANTS_MIN, LONGEST_H = 1000.0, (0.01, 100_000.0), 1e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,11 +73,16 @@ class Settings:
             raise DataError(
                 "method I, and only that, needs a given TDTF: its gain in µm/K and its time constant in min"
             )
-        if self.given_tdtf is not None and self.given_tdtf[1] <= 0.0:
-            raise DataError(f"given TDTF: time constant {self.given_tdtf[1]:g} min, expected a number above 0")
+        if self.given_tdtf is not None:
+            gain, tau_min = self.given_tdtf
+            low, high = TIME_CONSTANTS_MIN
+            if not abs(gain) <= LARGEST_GAIN_UM_PER_K:
+                raise DataError(f"given TDTF: gain {gain:g} µm/K, expected at most ±{LARGEST_GAIN_UM_PER_K:g}")
+            if not low <= tau_min <= high:
+                raise DataError(f"given TDTF: time constant {tau_min:g} min, expected from {low:g} to {high:g}")
         if not 2 <= self.folds <= MOST_FOLDS:
             raise DataError(f"folds {self.folds}, expected at least 2, at most {MOST_FOLDS}")
         if not 1 <= self.max_order <= LARGEST_ORDER:
             raise DataError(f"max order {self.max_order}, expected at least 1, at most {LARGEST_ORDER}")
-        if not self.etve_end_h > 0.0:
-            raise DataError(f"ETVE end {self.etve_end_h:g} h, expected more than 0")
+        if not 0.0 < self.etve_end_h <= LONGEST_H:
+            raise DataError(f"ETVE end {self.etve_end_h:g} h, expected more than 0, at most {LONGEST_H:g}")

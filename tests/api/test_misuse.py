@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -36,10 +37,20 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
         ({"folds": 0}, "folds 0, expected at least 2"),
         ({"name": "a\nb"}, "expected at most 300 printable"),
         ({"columns": ["t_q_degc"]}, "columns: list, expected names by role"),
+        *(
+            ({"method": "I", "tdtf": (gain, 10.0)}, f"gain {gain:g} µm/K, expected at most ±1000")
+            for gain in (1e308, -1e300, np.inf, np.nan)
+        ),
+        *(
+            ({"method": "I", "tdtf": (1.0, tau_min)}, f"time constant {tau_min:g} min, expected from 0.01 to 100000")
+            for tau_min in (5e-324, 0.0, 1e308, np.nan)
+        ),
+        *(({"fit_until_h": hour}, f"fit until {hour:g} h: expected more than 0, at most") for hour in (np.inf, np.nan)),
+        ({"etve_end_h": np.inf}, "ETVE end inf h, expected more than 0, at most"),
     ],
 )
 def test_a_wrong_option_is_named(table: pd.DataFrame, options: dict[str, object], words: str) -> None:
-    with pytest.raises(tc.CompensatorError, match=words) as raised:
+    with pytest.raises(tc.CompensatorError, match=re.escape(words)) as raised:
         tc.identify(table, **options)  # type: ignore[arg-type]
     assert "\n" not in str(raised.value)
 
