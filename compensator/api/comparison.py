@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from compensator.api.axis_results import PagedAxes
 from compensator.api.files import ModelLike, Paged, models_of, write_curves
+from compensator.api.simulation import doubts
 from compensator.arrays import Vector
 from compensator.axes import AxisWords
 from compensator.blas import one_thread
+from compensator.codes import Remark
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
 from compensator.data.frames import frame_of
 from compensator.data.measurement import DataLike, Measurement, check_each_once, measurements, screened_runs_in
-from compensator.display import Table
+from compensator.data.record import SampledRecord, require
+from compensator.display import Table, Words, warnings_of
 from compensator.errors import DataError, ModelError, UsageError
 from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
 from compensator.model.simulation import Scores
@@ -47,6 +50,8 @@ class ComparisonResult(Paged):
         Hour from which samples were compared.
     samples : int
         Number of samples compared.
+    remarks : tuple of Remark
+        Remarks on the data, and on doubtful predictions, as `simulate` has them.
     data : tuple of str
         Names of the files or tables.
     in_frame : bool
@@ -61,6 +66,7 @@ class ComparisonResult(Paged):
     t_h: Vector
     from_h: float
     samples: int
+    remarks: tuple[Remark, ...] = ()
     data: tuple[str, ...] = ()
     in_frame: bool = False
     words: AxisWords = field(default_factory=AxisWords)
@@ -86,11 +92,18 @@ class ComparisonResult(Paged):
     def to_dict(self) -> dict[str, Any]:
         """Return all figures."""
         found = {name: _without_nan(dataclasses.asdict(row)) for name, row in self.scores.items()}
-        return {"from_h": self.from_h, "samples": self.samples, "scores": found}
+        remarks = {
+            "remarks": [str(remark) for remark in self.remarks],
+            "remark_codes": [remark.code for remark in self.remarks],
+        }
+        return {"from_h": self.from_h, "samples": self.samples, "scores": found, **remarks}
 
-    def contents(self) -> list[str | Table]:
-        """Return the content: the verdict, the number of samples, and the errors of each model."""
-        return [self._verdict(), self.words(table_of_scores([self.scores]))]
+    def contents(self) -> list[str | Table | Words]:
+        """Return the content: the verdict, the number of samples, the errors of each model, remarks."""
+        return [self._verdict(), self.words(table_of_scores([self.scores])), *self._remarks()]
+
+    def _remarks(self) -> list[Words]:
+        return warnings_of(self.remarks, "Remarks on the data")
 
     def _verdict(self) -> str:
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
@@ -150,7 +163,7 @@ class ComparisonResult(Paged):
         return Page(
             title="Comparison of models",
             verdict=self._verdict(),
-            blocks=[*self.tables(), figure],
+            blocks=[*self.tables(), figure, *self._remarks()],
             tone=tone,
             data=self.data,
         )
@@ -254,8 +267,15 @@ def _compare(
 ) -> ComparisonResult:
     """Compare the models of one axis on its data."""
     period_s = next(iter(found.values())).period_s
+    remarks: list[Remark] = []
+
+    def doubt(record: SampledRecord, name: str) -> None:
+        require(name, record, ("t_q_degc", "at_degc"))
+        for model in found.values():
+            remarks.extend(doubts(name, model, record))
+
     for one in measured:
-        screened_runs_in([one], period_s)
+        remarks += screened_runs_in([one], period_s, check=doubt)[1]
     runs = free_runs(found, measured, from_h=from_h)
     if runs.samples < 2:
         count = "only one" if runs.samples else "no"
@@ -267,6 +287,7 @@ def _compare(
         t_h=runs.t_h,
         from_h=from_h,
         samples=runs.samples,
+        remarks=tuple(dict.fromkeys(words(remarks))),
         data=tuple(origin.name for one in measured for origin in one.origins),
         in_frame=any(one.in_frame for one in measured),
         words=words,

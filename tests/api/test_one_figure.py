@@ -179,3 +179,64 @@ def test_hours_that_took_no_part_are_named(folder: Path, tmp_path: Path, capfd: 
 def test_data_that_end_before_validate_nothing(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     words = ["diagnose", folder / "effect.csv", "--model", "quill", "--out", tmp_path / "d", "--fit-until", 10]
     assert "the data end after" in refused(capfd, *words)
+
+
+def spoilt(table: dict[str, np.ndarray], how: str) -> dict[str, np.ndarray]:
+    """Return a table with data that are missing, impossible or contradict each other."""
+    t_q, size = table["t_q_degc"].copy(), table["t_s"].size
+    match how:
+        case "every other":
+            t_q[::2] = np.nan
+        case "half, at random":
+            t_q[np.random.default_rng(1).permutation(size)[: size // 2]] = np.nan
+        case "hours":
+            t_q[300:600] = np.nan
+        case "wild":
+            t_q[50] = 1e5
+        case "hotter than the calibration":
+            t_q += np.clip(np.arange(size) - 300, 0, 120) * 0.5
+        case "equal times":
+            times = table["t_s"].copy()
+            times[100:110] = times[100]
+            return table | {"t_s": times}
+        case "contradicting":
+            twice = {name: np.repeat(values, 2) for name, values in table.items()}
+            twice["y_um"][1::2] += 50.0
+            return twice
+    return table | {"t_q_degc": t_q}
+
+
+@pytest.mark.parametrize(
+    ("how", "codes"),
+    [
+        ("every other", {"temperature_sparse"}),
+        ("half, at random", {"temperature_sparse"}),
+        ("hours", {"temperature_missing"}),
+        ("wild", {"wild_readings"}),
+        ("hotter than the calibration", {"outside_validity"}),
+        ("equal times", {"times_equal", "gap_bridged"}),
+        ("contradicting", {"times_equal"}),
+        ("as it was", set()),
+    ],
+)
+def test_compare_says_of_the_data_what_simulate_says(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], how: str, codes: set[str]
+) -> None:
+    with (folder / "run.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    data, page = tmp_path / "data.csv", tmp_path / "page.html"
+    write_table(data, spoilt(table, how))
+    assert main(["simulate", str(data), "--model", "quill", "--out", str(tmp_path / "o.csv")]) == 0
+    said = capfd.readouterr().err.splitlines()
+    words = ["compare", str(data), "--model", "quill", "--page", str(page)]
+    assert main(words) == 0
+    text = capfd.readouterr().out
+    found = run(capfd, *words)
+    assert set(found["remark_codes"]) == codes
+    marked = [f"{one} [{code}]" for one, code in zip(found["remarks"], found["remark_codes"], strict=True)]
+    assert sorted(marked) == sorted(said)
+    assert all(one in text for one in marked)
+    written = page.read_text(encoding="utf-8")
+    assert ("Remarks on the data" in text) == ("Remarks on the data" in written) == bool(codes)
+    assert all(f"<code>{code}</code>" in written for code in codes)
