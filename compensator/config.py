@@ -14,23 +14,19 @@ import msgspec
 from msgspec import Meta
 
 from compensator.config_axes import Axes, check_axes, with_limits_of_y
-from compensator.config_types import Micrometres, MicrometresPerMin, Name, Text
+from compensator.config_types import Kelvins, Micrometres, MicrometresPerMin, Minutes, Name, Rate, Text
 from compensator.config_types import Table as _Table
 from compensator.errors import ConfigError, UsageError
 from compensator.input_file import SETTINGS_BYTES, parse_toml, read_file, resolved
 
-Kelvins = Annotated[float, Meta(gt=0, le=200)]
-Minutes = Annotated[float, Meta(gt=0, le=100_000)]
-#: Of a channel of any unit, such as rpm/min.
-Rate = Annotated[float, Meta(gt=0, le=1e9)]
 #: Megabytes, or days, that are kept: a slip of the pen must not remove a whole history.
 Amount = Annotated[float, Meta(ge=1, le=1e9)]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
-#: Largest rate of a temperature, K/min, and the temperatures that any part of a machine can have, °C.
-_RATE_MAX, _TEMPERATURES = 10_000.0, (-273.15, 2000.0)
+#: Limits of the rate of a temperature, K/min, and the temperatures that any part of a machine can have, °C.
+_RATES, _TEMPERATURES = (0.001, 10_000.0), (-273.15, 2000.0)
 #: Largest magnitude of a value of a channel of any unit.
 _VALUE_MAX = 1e12
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
@@ -60,7 +56,7 @@ class Sampling(_Table, frozen=True, kw_only=True):
     """`[sampling]`: how often devices are polled, and how many readings make a sample."""
 
     poll_interval_s: Annotated[float, Meta(ge=0.01, le=3600)] = 1.0
-    min_good_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.5
+    min_good_fraction: Annotated[float, Meta(ge=0.001, le=1)] = 0.5
 
 
 class Channel(_Table, frozen=True, kw_only=True):
@@ -233,9 +229,9 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     mode: Literal["peer", "client", "router"] = "peer"
     listen: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
     connect: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
-    tls_ca: str | None = None
-    tls_certificate: str | None = None
-    tls_key: str | None = None
+    tls_ca: Text | None = None
+    tls_certificate: Text | None = None
+    tls_key: Text | None = None
     unproven_commands: bool | None = None
 
     def secured(self) -> bool:
@@ -270,8 +266,8 @@ class Recording(_Table, frozen=True, kw_only=True):
     folder: Text
     keep_days: Amount | None = None
     keep_mb: Amount | None = None
-    signing_key: str | None = None
-    head: str | None = None
+    signing_key: Text | None = None
+    head: Text | None = None
 
 
 class Config(_Table, frozen=True, kw_only=True):
@@ -520,8 +516,9 @@ def _check_channel(channel: Channel, devices: set[str]) -> None:
             if getattr(channel, key) is None:
                 raise ConfigError(f"{where}: {key} is missing; a limit of {channel.name} has no default")
     is_temperature = channel.name in ROLES[:2]
-    if is_temperature and channel.rate_max_per_min is not None and channel.rate_max_per_min > _RATE_MAX:
-        raise ConfigError(f"{where}: rate_max_per_min = {channel.rate_max_per_min:g}, expected at most {_RATE_MAX:g}")
+    rate = channel.rate_max_per_min
+    if is_temperature and rate is not None and not _RATES[0] <= rate <= _RATES[1]:
+        raise ConfigError(f"{where}: rate_max_per_min = {rate:g}, expected from {_RATES[0]:g} to {_RATES[1]:g}")
     if channel.range is not None:
         possible = _TEMPERATURES if is_temperature else (-_VALUE_MAX, _VALUE_MAX)
         _check_range(f"{where}: range", channel.range, possible)

@@ -18,11 +18,11 @@ from compensator.errors import ConfigError
 #: Axes that tilt, about X and about Y, and where their deformation at the tool acts.
 TILTS: Mapping[str, str] = {"a": "y", "b": "x"}
 
-#: Above 0, at most what a machine can have.
-Microradians = Annotated[float, Meta(gt=0, le=5000)]
-MicroradiansPerMin = Annotated[float, Meta(gt=0, le=1000)]
-MicrometresPerM = Annotated[float, Meta(gt=0, le=5000)]
-MicrometresPerMPerMin = Annotated[float, Meta(gt=0, le=1000)]
+#: From the smallest to the largest that a machine can have.
+Microradians = Annotated[float, Meta(ge=0.001, le=5000)]
+MicroradiansPerMin = Annotated[float, Meta(ge=0.001, le=1000)]
+MicrometresPerM = Annotated[float, Meta(ge=0.001, le=5000)]
+MicrometresPerMPerMin = Annotated[float, Meta(ge=0.001, le=1000)]
 Distance = Annotated[float, Meta(ge=1, le=20_000)]
 #: Of an axis' position, or of a tool.
 Position = Annotated[float, Meta(ge=-50_000, le=50_000)]

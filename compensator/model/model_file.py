@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
@@ -277,6 +278,7 @@ def _uncertainty(value: object) -> float:
 def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str, Any]]:
     """Return the calibration's error and the standard errors of its gains, which the file keeps there, and the rest."""
     rest = dict(TomlTable("provenance", value).table)
+    _check_figures(rest)
     held_out, stds = rest.pop(HELD_OUT_KEY, None), rest.pop(GAIN_STD_KEY, None)
     if held_out is not None and not isinstance(held_out, float):
         rest[HELD_OUT_KEY], held_out = held_out, None
@@ -284,6 +286,19 @@ def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str
     if stds is not None and not known:
         rest[GAIN_STD_KEY], stds = stds, None
     return held_out, stds or {}, rest
+
+
+def _check_figures(table: Mapping[str, Any]) -> None:
+    """Refuse a number that is none, wherever it stands: pages and summaries state these figures."""
+    inside: list[tuple[str, Any]] = [("", table)]
+    while inside:
+        where, value = inside.pop()
+        if isinstance(value, dict):
+            inside += [(f"{where}.{key}".lstrip("."), one) for key, one in value.items()]
+        elif isinstance(value, list):
+            inside += [(f"{where}[{i}]", one) for i, one in enumerate(value)]
+        elif isinstance(value, (int, float)) and not abs(value) <= sys.float_info.max:
+            raise ModelError(f"provenance: {where} = {shown(value)}, expected a finite number")
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:

@@ -124,6 +124,9 @@ def load(path: str) -> Setup:
     """
     loaded = load_config(path)
     config = loaded.config
+    folder = loaded.resolve(config.recording.folder)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{path}: recording.folder = {config.recording.folder!r}: is a file, expected a folder")
     model, model_bytes, store = _model(loaded)
     polls = model.period_s / config.sampling.poll_interval_s
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
@@ -212,7 +215,7 @@ def head_file(loaded: LoadedConfig) -> Path | None:
     Raises
     ------
     ConfigError
-        If it is among the recordings, or configured without a key.
+        If it is among the recordings, no regular file, or configured without a key.
     """
     recording = loaded.config.recording
     folder = loaded.resolve(recording.folder)
@@ -222,14 +225,14 @@ def head_file(loaded: LoadedConfig) -> Path | None:
                 f"{loaded.path}: recording.head = {recording.head!r}: needs recording.signing_key, which signs it"
             )
         return None
-    if recording.head is None:
-        return folder.parent / f"{loaded.config.machine.name}.head.json"
-    path = loaded.resolve(recording.head)
+    path = loaded.resolve(recording.head or f"{folder.parent}/{loaded.config.machine.name}.head.json")
     if path.is_relative_to(folder):
         raise ConfigError(
             f"{loaded.path}: recording.head = {recording.head!r}: is in the recording folder, expected a place that "
             "is not writable by those who can change the recordings"
         )
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{loaded.path}: recording.head = {str(path)!r}: is not a regular file, expected one")
     return path
 
 
@@ -243,7 +246,7 @@ def _unwritable_head(head: Path | None, recordings: Path) -> list[Remark]:
     folder = head.parent
     while not folder.exists() and folder in recordings.parents:  # it is made with that of the recordings
         folder = folder.parent
-    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK) and not head.is_dir():
+    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK):
         return []
     return [Remark(ServiceWarning.HEAD_NOT_WRITABLE, f"The head of the chain {head} cannot be written by this user.")]
 

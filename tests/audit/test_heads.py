@@ -329,6 +329,14 @@ def test_where_the_head_is_kept(tmp_path: Path) -> None:
     config('recording.head = "head.json"')
     with pytest.raises(ConfigError, match="needs recording"):
         head_file(load_config(path))
+    config('recording.signing_key = "machine.pem"', 'recording.head = ""')
+    with pytest.raises(ConfigError, match=r"recording\.head = ''"):
+        load_config(path)
+    (tmp_path / "folder").mkdir()
+    for head in ("/dev/null", "folder"):
+        config('recording.signing_key = "machine.pem"', f'recording.head = "{head}"')
+        with pytest.raises(ConfigError, match="is not a regular file"):
+            head_file(load_config(path))
 
 
 def test_what_lies_behind_the_head_is_counted_from_it(shop: Shop) -> None:

@@ -6,14 +6,16 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from compensator.api.diagnosis import diagnose
 from compensator.api.identification import identify
 from compensator.cli import main
-from compensator.config import parse_config
+from compensator.config import Config, parse_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.input_file import parse_toml, read_file
 from compensator.model.model_file import parse_model, read_model_bytes
@@ -159,6 +161,20 @@ LIMITS = [
     ("predict_for_min = 10.0", "predict_for_min = 1e308"),
     ("t_q_below_at_max_k = 2.0", "t_q_below_at_max_k = inf"),
     ("rest_rate_um_per_min = 0.2", "rest_rate_um_per_min = inf"),
+    *(
+        (line, f"{line.partition('=')[0]}= {value}")
+        for value in ("5e-324", "1e-10", "0.0")
+        for line in (
+            "offset_max_um = 200.0",
+            "offset_rate_max_um_per_min = 8.0",
+            "rate_max_per_min = 5.0",
+            "stuck_after_min = 60.0",
+            "predict_for_min = 10.0",
+            "t_q_below_at_max_k = 2.0",
+            "rest_rate_um_per_min = 0.2",
+        )
+    ),
+    ('folder = "rec"', 'folder = ""'),
     ('folder = "rec"', 'folder = "a\\u0000b"'),
     ('name = "vmc-07"', 'name = "\\u0000"'),
 ]
@@ -176,6 +192,57 @@ def test_limits_are_finite_and_possible(before: str, after: str) -> None:
         assert before.partition(" ")[0] in str(refusal.value)
 
 
+def numbers_in(kind: object, where: str) -> Iterator[tuple[str, msgspec.inspect.FloatType]]:
+    """Every number of a table and of those in it; bounds of a range are checked apart."""
+    for part in getattr(kind, "fields", ()):
+        yield from numbers_in(part.type, f"{where}.{part.encode_name}")
+    for inner in (*getattr(kind, "types", ()), *filter(None, [getattr(kind, "item_type", None)])):
+        yield from numbers_in(inner, where)
+    if isinstance(kind, msgspec.inspect.FloatType):
+        yield where, kind
+
+
+def test_every_number_of_a_configuration_has_a_smallest_and_a_largest_value() -> None:
+    found = list(numbers_in(msgspec.inspect.type_info(Config), "config"))
+    assert len(found) > 40
+    for where, kind in found:
+        assert kind.gt is None and kind.ge is not None and kind.le is not None, where
+        assert kind.ge <= 0.0 or kind.ge >= 1e-9, where
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "guards = {t_q_below_at_max_k = 2.0, suspect_jumps = true, jump_min_k = TINY}",
+        "plausibility.residual_std_um = TINY",
+        "plausibility.residual_hold_um = TINY",
+        "restart.bridge_max_min = TINY",
+        "probe = {std_um = 1.0, measured_max_um = 30.0, largest_um = 20.0, tolerance_um = TINY}",
+    ],
+)
+def test_optional_limits_have_a_smallest_value(line: str) -> None:
+    text = CONFIG.decode().replace("guards.t_q_below_at_max_k = 2.0\n", "") if "guards" in line else CONFIG.decode()
+    parse_config(f"{line.replace('TINY', '1.0')}\n{text}".encode(), source="c.toml")
+    with pytest.raises(ConfigError, match=r"^c\.toml: .* = 5e-324: Expected `float` >= 0\.0"):
+        parse_config(f"{line.replace('TINY', '5e-324')}\n{text}".encode(), source="c.toml")
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "1" + "0" * 400])
+@pytest.mark.parametrize("key", ["fit_ttf_pct", "folds_rms_um", "free_run.scores.rms_um", "parts"])
+def test_figures_of_a_model_file_are_finite(key: str, value: str) -> None:
+    text = read_model_bytes("quill").decode().replace("fit_ttf_pct = 98.18\n", "")
+    assert text.count("[provenance]\n") == 1
+    own = "[{rms_um = VALUE}]" if key == "parts" else "VALUE"
+
+    def model(number: str) -> bytes:
+        return text.replace("[provenance]\n", f"[provenance]\n{key} = {own.replace('VALUE', number)}\n").encode()
+
+    parse_model(model("1.5"), source="m.toml")
+    with pytest.raises(ModelError, match=rf"^m\.toml: provenance: {key}\S* = .*, expected a finite number$") as refusal:
+        parse_model(model(value), source="m.toml")
+    assert len(str(refusal.value)) < 300
+
+
 @pytest.mark.parametrize("bounds", ["[-inf, inf]", "[-300.0, 60.0]", "[0.0, 1e308]", "[nan, 60.0]"])
 def test_ranges_of_temperatures_are_possible(bounds: str) -> None:
     text = CONFIG.decode()
@@ -191,6 +258,13 @@ def test_ranges_of_temperatures_are_possible(bounds: str) -> None:
         model = model[:begin] + bounds + model[model.index("]", begin) + 1 :]
     with pytest.raises(ModelError, match=r"validity: t_q_degc"):
         parse_model(model.encode(), source="m.toml")
+
+
+def test_a_folder_of_recordings_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rec").write_text("")
+    (tmp_path / "c.toml").write_bytes(CONFIG)
+    line = refused(capsys, "check", "--config", tmp_path / "c.toml")
+    assert "recording.folder = 'rec': is a file, expected a folder" in line
 
 
 def test_a_loop_of_links_in_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
