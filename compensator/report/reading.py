@@ -18,6 +18,7 @@ from compensator.report.figure import Figure
 
 #: Seconds of a day, the unit of an axis of times of day; of an hour.
 _DAY_S, _HOUR_S = 86400.0, 3600.0
+_WEEK_H = 168
 
 
 @cache
@@ -103,11 +104,21 @@ def _unit(label: str) -> str:
 
 def _zone(first: float, last: float) -> list[list[float]]:
     """Return the offsets of this computer's zone between two times, each with the time from which it is valid; days."""
-    offsets: list[list[float]] = []
-    hours = range(int(first * _DAY_S // _HOUR_S), int(last * _DAY_S // _HOUR_S) + 1)
-    for hour in hours:
-        offset = datetime.fromtimestamp(hour * _HOUR_S, tz=UTC).astimezone(tzlocal()).utcoffset()
-        days = offset.total_seconds() / _DAY_S if offset is not None else 0.0
-        if not offsets or offsets[-1][1] != days:
-            offsets.append([hour * _HOUR_S / _DAY_S, days])
-    return offsets or [[first, 0.0]]
+    hour, end = int(first * _DAY_S // _HOUR_S), int(last * _DAY_S // _HOUR_S)
+    offsets = [[hour * _HOUR_S / _DAY_S, _ahead(hour)]]
+    while hour < end:
+        # It changes once within a week at most. A time that is far off is centuries of hours away.
+        low, high = hour, min(hour + _WEEK_H, end)
+        if _ahead(high) != offsets[-1][1]:
+            while high - low > 1:
+                middle = (low + high) // 2
+                low, high = (middle, high) if _ahead(middle) == offsets[-1][1] else (low, middle)
+            offsets.append([high * _HOUR_S / _DAY_S, _ahead(high)])
+        hour = high
+    return offsets
+
+
+def _ahead(hour: int) -> float:
+    """Return by how much this computer's zone is ahead of UTC in an hour since 1970, days."""
+    offset = datetime.fromtimestamp(hour * _HOUR_S, tz=UTC).astimezone(tzlocal()).utcoffset()
+    return offset.total_seconds() / _DAY_S if offset is not None else 0.0

@@ -93,6 +93,18 @@ def test_times_of_day_follow_the_change_to_summer_time(monkeypatch: pytest.Monke
     assert offsets[1][0] * 86400.0 == 1774746000.0
 
 
+def test_a_time_that_is_far_off_costs_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One record of the year 2262 among those of a day; every change until then is found."""
+    asked: list[int] = []
+    monkeypatch.setattr(reading, "tzlocal", lambda: asked.append(1) or tz.gettz("Europe/Prague"))
+    offsets = reading._zone(20_000.0, 106_000.0)
+    assert len(asked) < 30_000
+    hours = [time * 24.0 for time, _ in offsets[1:]]
+    assert len(hours) > 2 * 12  # until 2037 at least
+    for hour, (_, offset) in zip(hours, offsets[1:], strict=True):
+        assert round(hour) == hour and reading._ahead(round(hour)) == offset != reading._ahead(round(hour) - 1)
+
+
 HARNESS = """<!doctype html><meta charset="utf-8"><iframe width="1000" height="1400" srcdoc="%s"></iframe>
 <pre id="seen"></pre><script>
 addEventListener("load", () => {
