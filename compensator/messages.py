@@ -1,8 +1,8 @@
 """What the service records and publishes: JSON messages with a schema each.
 
 A missing value is NaN in memory and null in JSON; the encoder turns one into the other, and `number` turns
-it back. The JSON Schemas in `compensator/schemas` are made from these classes by `schemas()`; a test keeps
-the two together.
+it back. The types bound what a message can hold, so whoever reads one by `read_message` has the same bounds. The JSON
+Schemas in `compensator/schemas` are made from these classes by `schemas()`; a test keeps the two together.
 """
 
 from __future__ import annotations
@@ -19,6 +19,25 @@ from compensator.codes import SampleQuality, State
 
 #: Version of the messages.
 SCHEMA = 1
+#: Largest number of a sample, ten a second for 300 years, and latest time, in 2262. The receiver stands alone and has
+#: the same bounds; a test compares them.
+SEQ_MAX, TIME_MAX_NS = 100_000_000_000, 2**63 - 1
+#: Largest magnitude of what is measured, and of any number. What a model makes of readings stays below the second, and
+#: what a reader makes of that, squares for example, remains finite.
+READING_MAX, NUMBER_MAX = 1e12, 1e30
+
+SampleNumber = Annotated[int, Meta(ge=0, le=SEQ_MAX)]
+TimeNs = Annotated[int, Meta(ge=0, le=TIME_MAX_NS)]
+Reading = Annotated[float, Meta(ge=-READING_MAX, le=READING_MAX)]
+Number = Annotated[float, Meta(ge=-NUMBER_MAX, le=NUMBER_MAX)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+#: Number of a record in its file, −1 before the first.
+RecordNumber = Annotated[int, Meta(ge=-1, le=2**32 - 1)]
+#: Period of samples as a model file may have it, s.
+PeriodS = Annotated[float, Meta(ge=0.1, le=3600.0)]
+
+#: Longest place of a number that is named, characters.
+_PLACE = 80
 #: What reading bytes as JSON raises that is not such a message: also nested thousands deep, which is no MsgspecError.
 UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
@@ -44,15 +63,15 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
         Codes of bad readings and device errors in this sample, with their number.
     """
 
-    mean: float | None
-    min: float | None
-    max: float | None
-    spread: float | None
-    count: int
-    polls: int
+    mean: Number | None
+    min: Number | None
+    max: Number | None
+    spread: Number | None
+    count: Count
+    polls: Count
     quality: str
     device_quality: str
-    errors: dict[str, int] = {}
+    errors: dict[str, Count] = {}
 
     @property
     def is_good(self) -> bool:
@@ -65,8 +84,8 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 
     schema: int
     machine: str
-    seq: int
-    time_utc_ns: int
+    seq: SampleNumber
+    time_utc_ns: TimeNs
 
 
 class Sample(Message, frozen=True, kw_only=True):
@@ -84,7 +103,7 @@ class Sample(Message, frozen=True, kw_only=True):
         By channel name, unit in the name.
     """
 
-    period_s: float
+    period_s: PeriodS
     channels: dict[str, ChannelSample]
 
 
@@ -112,22 +131,22 @@ class EstimateMessage(Message, frozen=True, kw_only=True):
         Measured deformation since the zero, and measured − predicted, µm.
     """
 
-    t_q_ref_degc: float | None
-    at_ref_degc: float | None
-    y_ref_um: float | None
-    t_q_shift_k: float | UnsetType = UNSET
-    at_shift_k: float | UnsetType = UNSET
-    heat_w: float | None
-    heat_std_w: float | None
-    y_dtf_um: float | None
-    y_tdtf_um: float | None
-    y_effects_um: list[float]
-    y_base_um: float
-    y_pred_um: float | None
-    y_std_um: float | None
-    y_rate_um_per_min: float | None
-    y_um: float | None
-    residual_um: float | None
+    t_q_ref_degc: Number | None
+    at_ref_degc: Number | None
+    y_ref_um: Number | None
+    t_q_shift_k: Number | UnsetType = UNSET
+    at_shift_k: Number | UnsetType = UNSET
+    heat_w: Number | None
+    heat_std_w: Number | None
+    y_dtf_um: Number | None
+    y_tdtf_um: Number | None
+    y_effects_um: list[Number]
+    y_base_um: Number
+    y_pred_um: Number | None
+    y_std_um: Number | None
+    y_rate_um_per_min: Number | None
+    y_um: Number | None
+    residual_um: Number | None
 
 
 class Offset(Message, frozen=True, kw_only=True):
@@ -153,10 +172,10 @@ class Offset(Message, frozen=True, kw_only=True):
         Hash of the model file.
     """
 
-    valid_for_s: float
-    y_offset_um: float | None
-    y_offset_rate_um_per_min: float | None
-    y_offset_std_um: float | None
+    valid_for_s: Number
+    y_offset_um: Number | None
+    y_offset_rate_um_per_min: Number | None
+    y_offset_std_um: Number | None
     state: State
     reasons: list[str]
     model_sha256: str
@@ -219,16 +238,16 @@ class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
     diagnosing: bool
     model_sha256: str
     effects: list[str]
-    since_utc_ns: int
-    y_pred_um: float | None
+    since_utc_ns: TimeNs
+    y_pred_um: Number | None
     verdict: str
     text: str
-    present_rms_um: float | None
-    candidate_rms_um: float | None
-    deviations: float | None
-    hours: float
-    probes: int
-    adopted_utc_ns: int
+    present_rms_um: Number | None
+    candidate_rms_um: Number | None
+    deviations: Number | None
+    hours: Number
+    probes: Count
+    adopted_utc_ns: TimeNs
     before_effects: list[str] | None = None
     before_text: str = ""
     others: list[str] = []
@@ -267,17 +286,17 @@ class Status(Message, frozen=True, kw_only=True):
     model: str
     model_kind: str
     model_sha256: str
-    started_utc_ns: int
+    started_utc_ns: TimeNs
     recording: str
     devices: dict[str, str]
     effects: list[str] = []
     probe_wanted: bool | UnsetType = UNSET
-    wanted_by_ns: int | UnsetType | None = UNSET
+    wanted_by_ns: TimeNs | UnsetType | None = UNSET
     wanted_why: str | UnsetType = UNSET
-    wanted_std_um: float | UnsetType | None = UNSET
-    wanted_tolerance_um: float | UnsetType | None = UNSET
+    wanted_std_um: Number | UnsetType | None = UNSET
+    wanted_tolerance_um: Number | UnsetType | None = UNSET
     loop: LoopStatus | UnsetType = UNSET
-    predicts_until_utc_ns: int | UnsetType = UNSET
+    predicts_until_utc_ns: TimeNs | UnsetType = UNSET
 
 
 # No control characters, line ends or marks of the direction; `$` would accept a line end after the last character, and
@@ -317,14 +336,14 @@ class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     schema: int
-    time_utc_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)]
+    time_utc_ns: TimeNs
     axis: _Label
-    measured_um: float
-    offset_applied_um: float
-    std_um: float | None = None
+    measured_um: Reading
+    offset_applied_um: Reading
+    std_um: Reading | None = None
     feature: _Label = ""
     tool: _Label = ""
-    stopped_s: Annotated[float, Meta(ge=0)] | None = None
+    stopped_s: Annotated[float, Meta(ge=0, le=READING_MAX)] | None = None
 
 
 class Probe(Message, frozen=True, kw_only=True):
@@ -356,22 +375,22 @@ class Probe(Message, frozen=True, kw_only=True):
     """
 
     axis: str
-    measured_um: float | None
-    std_um: float | None
-    offset_applied_um: float | None
+    measured_um: Number | None
+    std_um: Number | None
+    offset_applied_um: Number | None
     feature: str
     tool: str
-    stopped_s: float | None
-    received_utc_ns: int
+    stopped_s: Number | None
+    received_utc_ns: TimeNs
     by: str
     by_proof: str
     taken: bool
     code: str
     text: str
-    deformation_um: float | None
-    predicted_um: float | None
-    innovation_um: float | None
-    innovation_std_um: float | None
+    deformation_um: Number | None
+    predicted_um: Number | None
+    innovation_um: Number | None
+    innovation_std_um: Number | None
 
     @property
     def is_read(self) -> bool:
@@ -412,18 +431,18 @@ class Candidate(Message, frozen=True, kw_only=True):
 
     model_sha256: str
     role: Literal["candidate", "before"]
-    y_pred_um: float | None
-    y_std_um: float | None
-    residual_um: float | None
-    present_residual_um: float | None
-    innovations_um: list[float | None]
+    y_pred_um: Number | None
+    y_std_um: Number | None
+    residual_um: Number | None
+    present_residual_um: Number | None
+    innovations_um: list[Number | None]
     reasons: list[str]
     verdict: str
-    present_rms_um: float | None
-    candidate_rms_um: float | None
-    deviations: float | None
-    hours: float
-    probes: int
+    present_rms_um: Number | None
+    candidate_rms_um: Number | None
+    deviations: Number | None
+    hours: Number
+    probes: Count
 
 
 class ChainPart(msgspec.Struct, frozen=True, kw_only=True):
@@ -455,7 +474,7 @@ class ChainLink(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     topic: str
-    sequence: int
+    sequence: RecordNumber
     sha256: str
 
 
@@ -474,7 +493,7 @@ class Chain(msgspec.Struct, frozen=True, kw_only=True):
 
     schema: int
     machine: str
-    time_utc_ns: int
+    time_utc_ns: TimeNs
     before: str
     parts: list[ChainPart]
     records: list[ChainLink]
@@ -498,9 +517,9 @@ class Seal(msgspec.Struct, frozen=True, kw_only=True):
 
     schema: int
     machine: str
-    time_utc_ns: int
+    time_utc_ns: TimeNs
     reason: str
-    sequence: int
+    sequence: RecordNumber
     sha256: str
     public_key: str
     signature: str
@@ -536,6 +555,52 @@ _ENCODER = msgspec.json.Encoder()
 def encode(message: msgspec.Struct) -> bytes:
     """Encode a message as JSON; NaN becomes null, floats keep every bit."""
     return _ENCODER.encode(message)
+
+
+_Decoded = TypeVar("_Decoded")
+
+
+def read_message(decoder: msgspec.json.Decoder[_Decoded], data: bytes) -> _Decoded:
+    """Decode a message that somebody else may have written; it holds no number that a message cannot hold.
+
+    Raises
+    ------
+    msgspec.MsgspecError, UnicodeDecodeError, RecursionError
+        As `UNREADABLE`, if it is not such a message.
+    """
+    message = decoder.decode(data)
+    if isinstance(message, Event):
+        check_numbers(message.data, "$.data")
+    return message
+
+
+def check_numbers(value: Any, place: str = "$", most: float = NUMBER_MAX) -> None:
+    """Check every number in nested lists and tables that no type bounds; NaN and infinity may stand for themselves.
+
+    Parameters
+    ----------
+    value : object
+        Decoded JSON.
+    place : str
+        Where it stands, for the error.
+    most : float
+        Largest magnitude of a finite number; that of a whole number is `TIME_MAX_NS`.
+
+    Raises
+    ------
+    msgspec.ValidationError
+        If one is too large; the message names its place.
+    """
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            check_numbers(entry, f"{place}.{key}"[:_PLACE], most)
+    elif isinstance(value, (list, tuple)):
+        for entry in value:
+            check_numbers(entry, f"{place}[...]"[:_PLACE], most)
+    elif isinstance(value, int) and abs(value) > TIME_MAX_NS:
+        raise msgspec.ValidationError(f"Expected `int` <= {TIME_MAX_NS} - at `{place}`")
+    elif isinstance(value, float) and most < abs(value) < math.inf:
+        raise msgspec.ValidationError(f"Expected `float` <= {most:g} - at `{place}`")
 
 
 def number(value: float | None) -> float:

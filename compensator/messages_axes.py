@@ -7,13 +7,14 @@ units of the axis, such as `z_offset_um` or `a_offset_urad`. A machine with Y al
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated
 
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 
 from compensator.axes import FIRST
 from compensator.codes import State
-from compensator.messages import MESSAGES, EstimateMessage, Offset, Status, number
+from compensator.messages import MESSAGES, EstimateMessage, Number, Offset, Status, number
 
 #: Axes of a control and its tilts, each with the unit of its offset.
 UNITS: Mapping[str, str] = {"x": "um", "y": "um", "z": "um", "a": "urad", "b": "urad"}
@@ -47,11 +48,11 @@ class AxisOffset(Offset, frozen=True, kw_only=True):
     axis: str
     axes: list[str]
     acts_on: str | UnsetType = UNSET
-    reference_mm: float | UnsetType = UNSET
-    y_slope_um_per_m: float | UnsetType | None = UNSET
-    y_slope_rate_um_per_m_per_min: float | UnsetType | None = UNSET
-    y_slope_std_um_per_m: float | UnsetType | None = UNSET
-    sign: int | UnsetType = UNSET
+    reference_mm: Number | UnsetType = UNSET
+    y_slope_um_per_m: Number | UnsetType | None = UNSET
+    y_slope_rate_um_per_m_per_min: Number | UnsetType | None = UNSET
+    y_slope_std_um_per_m: Number | UnsetType | None = UNSET
+    sign: Annotated[int, Meta(ge=-1, le=1)] | UnsetType = UNSET
 
 
 class AxesEstimate(EstimateMessage, frozen=True, kw_only=True):
@@ -65,7 +66,7 @@ class AxesEstimate(EstimateMessage, frozen=True, kw_only=True):
         are in the names; rates are in the offsets.
     """
 
-    axes: dict[str, float | list[float] | None]
+    axes: dict[str, Number | list[Number] | None]
 
 
 class AxisState(msgspec.Struct, frozen=True, kw_only=True):

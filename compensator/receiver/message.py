@@ -13,8 +13,8 @@ from .reasons import Reason, printable
 SCHEMA = 1
 #: Longest payload, bytes; an offset has about 300.
 PAYLOAD_MAX_BYTES = 65_536
-#: Largest number of a message: ten samples a second for 300 years.
-SEQ_MAX = 100_000_000_000
+#: Largest number of a message, ten samples a second for 300 years, and latest time, in 2262.
+SEQ_MAX, TIME_MAX_NS = 100_000_000_000, 2**63 - 1
 #: Axes and angles that a service may publish besides Y.
 FURTHER = ("x", "z", "a", "b")
 _STATES = ("starting", "ok", "degraded", "hold", "fault")
@@ -22,7 +22,6 @@ _STATES = ("starting", "ok", "degraded", "hold", "fault")
 USABLE = ("ok", "degraded")
 #: Number of codes in a message, and their length.
 _CODES_MAX, _CODE_LENGTH = 100, 200
-_INT_MAX = 2**63 - 1
 
 
 class Rejected(Exception):
@@ -300,7 +299,7 @@ def _shown(value: object) -> str:
     return printable(str(value), 40)
 
 
-def integer(table: dict[str, Any], key: str, most: int = _INT_MAX) -> int:
+def integer(table: dict[str, Any], key: str, most: int = TIME_MAX_NS) -> int:
     """Return a whole number, 0 or more."""
     value = table.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:

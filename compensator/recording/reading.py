@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from compensator.errors import DataError, UsageError
-from compensator.messages import MESSAGES, UNREADABLE, Chain
+from compensator.messages import MESSAGES, UNREADABLE, Chain, read_message
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, AxesEstimate, names_axes, topic_of
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
@@ -231,10 +231,10 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: RawRecord, file: str)
     Raises
     ------
     DataError
-        If the message has another type; the error names file, topic and record.
+        If the message has another type or a number that no message holds; the error names file, topic and record.
     """
     try:
-        return decoder.decode(record.data)
+        return read_message(decoder, record.data)
     except UNREADABLE as error:
         raise DataError(f"{file}: /{record.topic} record {record.sequence}: {error}") from error
 

@@ -19,7 +19,7 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.codes import Remark, ServiceWarning
-from compensator.messages import UNREADABLE, Offset, number
+from compensator.messages import UNREADABLE, Number, Offset, SampleNumber, TimeNs, number
 
 log = logging.getLogger("compensator")
 
@@ -34,10 +34,10 @@ class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     `further` are the values of further outputs by name, each in its unit.
     """
 
-    seq: int
-    time_utc_ns: int
-    y_offset_um: float
-    further: dict[str, float] = {}
+    seq: SampleNumber
+    time_utc_ns: TimeNs
+    y_offset_um: Number
+    further: dict[str, Number] = {}
 
 
 class OffsetCheckpoint:
@@ -118,7 +118,7 @@ class OffsetCheckpoint:
             except UNREADABLE as error:
                 self._refuse(str(error))
                 return None
-        if not abs(checkpointed.y_offset_um) <= offset_max_um or checkpointed.seq < 0:
+        if not abs(checkpointed.y_offset_um) <= offset_max_um:
             self._refuse(f"offset {checkpointed.y_offset_um:g} µm, number {checkpointed.seq}")
             return None
         for name, largest in (further_max or {}).items():

@@ -17,7 +17,7 @@ from compensator.clock import NS, Clock
 from compensator.codes import SampleQuality
 from compensator.config import Config
 from compensator.events import EventKind
-from compensator.messages import ChannelSample
+from compensator.messages import READING_MAX, ChannelSample
 from drivers.errors import DriverError
 from drivers.reading import Device, Quality, Reading
 
@@ -96,8 +96,11 @@ class ChannelCollector:
     def add(self, reading: Reading | None, error: str | None = None) -> None:
         """Add the result of one poll: a reading, or the code of the error."""
         self._polls += 1
-        if reading is not None and reading.quality is Quality.GOOD and math.isfinite(reading.value):
-            self._readings.append(reading)
+        if reading is not None and reading.quality is Quality.GOOD:
+            if all(abs(value) <= READING_MAX for value in (reading.value, reading.minimum, reading.maximum)):
+                self._readings.append(reading)
+            else:
+                self._errors[str(Quality.INVALID)] += 1
         elif reading is not None:
             self._errors[str(reading.quality)] += 1
         else:

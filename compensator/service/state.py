@@ -17,7 +17,7 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
-from compensator.messages import UNREADABLE
+from compensator.messages import SEQ_MAX, UNREADABLE, TimeNs, check_numbers
 from compensator.model.covariance import may_be_covariance
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
@@ -79,8 +79,8 @@ class Memory:
         Remaining time for which the state counts as unknown, min.
     """
 
-    seq: int = -1
-    time_utc_ns: int = 0
+    seq: Annotated[int, msgspec.Meta(ge=-1, le=SEQ_MAX)] = -1
+    time_utc_ns: TimeNs = 0
     estimate: Estimate | None = None
     missing_min: float = 0.0
     rates: list[float] = field(default_factory=list)
@@ -200,6 +200,7 @@ def decode_state(data: bytes) -> CompensationState:
     try:
         # Not strict, so that a string may be a number.
         state = msgspec.json.decode(data, type=CompensationState, strict=False)
+        check_numbers(msgspec.to_builtins(state), most=LARGEST_COVARIANCE)
     except (*UNREADABLE, ValueError) as error:
         raise DataError(f"state: {error}") from error
     if state.schema != STATE_SCHEMA:

@@ -12,7 +12,17 @@ from msgspec import UNSET, UnsetType
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
-from compensator.messages import SCHEMA, UNREADABLE, Candidate, EstimateMessage, Event, Offset, Sample, Status
+from compensator.messages import (
+    SCHEMA,
+    UNREADABLE,
+    Candidate,
+    EstimateMessage,
+    Event,
+    Offset,
+    Sample,
+    Status,
+    read_message,
+)
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
 from compensator.watch.axes import axis_snapshot, worst
 from compensator.watch.cutting import Headline, headline
@@ -54,9 +64,11 @@ _STATUS = ("version", "model", "model_kind", "started_utc_ns", "recording", "dev
 
 #: Where the newest message of each kind is kept.
 _KEPT = {"_sample": Sample, "_estimate": EstimateMessage, "_status": Status}
-_DECODERS = {kind: msgspec.json.Decoder(ALL_MESSAGES[kind]) for kind in KINDS.values()}
+_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
+    kind: msgspec.json.Decoder(ALL_MESSAGES[kind]) for kind in KINDS.values()
+}
 #: Of Y on a machine of several axes.
-_OF_SEVERAL = msgspec.json.Decoder(OFFSETS["y"])
+_OF_SEVERAL: msgspec.json.Decoder[Any] = msgspec.json.Decoder(OFFSETS["y"])
 
 
 class Malformed(ValueError):
@@ -74,14 +86,14 @@ def decoded(kind: str, payload: bytes) -> Any:
     if len(payload) > LONGEST:
         raise Malformed(f"{kind}: {len(payload)} bytes, expected at most {LONGEST}")
     try:
-        decoder = _OF_SEVERAL if kind == "offset" and names_axes(payload) else _DECODERS[kind]
-        message: Any = decoder.decode(payload)
+        decoder: msgspec.json.Decoder[Any] = (
+            _OF_SEVERAL if kind == "offset" and names_axes(payload) else _DECODERS[kind]
+        )
+        message = read_message(decoder, payload)
     except UNREADABLE as error:
         raise Malformed(f"{kind}: {error}") from error
     if message.schema != SCHEMA:
         raise Malformed(f"{kind}: schema = {message.schema}, expected {SCHEMA}")
-    if not (0 <= message.seq < 2**63 and 0 <= message.time_utc_ns < 2**63):
-        raise Malformed(f"{kind}: seq = {message.seq}, time_utc_ns = {message.time_utc_ns}, expected 0 to 2^63")
     return message
 
 

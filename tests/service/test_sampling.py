@@ -13,7 +13,7 @@ import drivers
 from compensator.clock import VirtualClock
 from compensator.codes import SampleQuality
 from compensator.messages import ChannelSample, number
-from compensator.service.sampling import Sampler
+from compensator.service.sampling import ChannelCollector, Sampler
 from drivers.errors import DeviceGarbled
 from drivers.reading import Reading
 from sim_hardware.wire import IcpDas, ModbusRtuLine
@@ -27,6 +27,18 @@ class LoopClock(VirtualClock):
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
         if tasks:
             await asyncio.wait(tasks, timeout=timeout_s)
+
+
+@pytest.mark.parametrize("value", [1.1e12, -1e300, math.inf, math.nan])
+def test_a_reading_that_no_recording_holds_is_invalid(value: float) -> None:
+    """Else the service could not read its own recording at the next start."""
+    collector = ChannelCollector(0.5)
+    for _ in range(4):
+        collector.add(Reading.good(value))
+    collector.add(Reading.good(20.0))
+    sample = collector.close()
+    assert sample.quality == "invalid" and sample.errors == {"invalid": 4} and sample.count == 1
+    assert math.isnan(sample.mean or 0.0) and sample.max == 20.0
 
 
 class SlowDevice:

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.errors import CompensatorError, DataError
-from compensator.messages import encode
+from compensator.messages import SEQ_MAX, encode
 from compensator.model.effects import kinds
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.state import decode_state, encode_state
+from compensator.service.state import LARGEST_COVARIANCE, decode_state, encode_state
 from tests.service.records import EFFECTS, QUILL, day, direct, late, with_effects, with_method
 from tests.service.simulated import TABLE, config
 
@@ -50,6 +50,8 @@ LOST = {
     "coolant_degc": [range(40, 43), range(93, 110)],
 }
 
+#: What a state may hold: whatever is not finite stands for itself, and no finite number is larger than a covariance.
+NUMBERS = st.floats(-LARGEST_COVARIANCE, LARGEST_COVARIANCE) | st.sampled_from([math.inf, -math.inf, math.nan])
 #: Where the effects of each kind stand in the state; the last one of a kind.
 PLACE = {kind: i for i, (kind, _) in enumerate(EFFECTS)}
 
@@ -115,7 +117,7 @@ def test_a_settled_covariance_stays_settled() -> None:
     assert [bits(restored.process(r)) for r in raws[1800:]] == [bits(whole.process(r)) for r in raws[1800:]]
 
 
-@given(st.tuples(*[st.floats(), st.floats(min_value=0.0)] * 2), st.floats(), st.floats())
+@given(st.tuples(*[NUMBERS, st.floats(0.0, 1e60)] * 2), NUMBERS, NUMBERS)
 @settings(max_examples=200, deadline=None)
 def test_every_number_comes_back_to_the_bit(
     guard: tuple[float, float, float, float], y_ref: float, missing: float
@@ -178,6 +180,11 @@ def changed(state: dict[str, Any], value: Any, *keys: Any) -> dict[str, Any]:
         (changed(at_work(), "nan", "engine", "reference", "at_degc"), "not finite"),
         (changed(at_work(), -5.0, "engine", "observer", "p", 0), "covariance"),
         (changed(at_work(), 1e9, "engine", "observer", "p", 1), "covariance"),
+        (changed(at_work(), 1e300, "memory", "missing_min"), "memory.missing_min"),
+        (changed(at_work(), [0.0, 0.0, -1e61, 0.0], "guards", "y_um"), "guards"),
+        (changed(at_work(), int("9" * 400), "memory", "time_utc_ns"), "memory.time_utc_ns"),
+        (changed(at_work(), "9" * 400, "memory", "time_utc_ns"), "memory.time_utc_ns"),
+        (changed(at_work(), SEQ_MAX + 1, "memory", "seq"), "memory.seq"),
         (changed(at_work(), [0.0], "engine", "gap", "state", "observer", "x"), "snapshot of 1 states"),
         (changed(at_work(), {"x": 1.0}, "engine", "gap", "before", "channels"), "channels"),
         (changed(at_work(with_effects()), [1.0, 2.0], "engine", "effects", PLACE["hysteresis"]), "hysteresis"),

@@ -8,7 +8,7 @@ import msgspec
 
 from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
-from compensator.messages import UNREADABLE
+from compensator.messages import UNREADABLE, check_numbers
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
@@ -207,6 +207,8 @@ def decode_loop(data: bytes) -> LoopState:
         schema = msgspec.json.decode(data, type=_Version).schema
         if schema != STATE_SCHEMA:
             raise DataError(f"loop.json: schema = {schema}, expected {STATE_SCHEMA}")
-        return msgspec.json.decode(data, type=LoopState)
+        state = msgspec.json.decode(data, type=LoopState)
+        check_numbers(msgspec.to_builtins(state))
+        return state
     except UNREADABLE as error:
         raise DataError(f"loop.json: {error}") from error
