@@ -25,11 +25,14 @@ SEQ_MAX, TIME_MAX_NS = 100_000_000_000, 2**63 - 1
 #: Largest magnitude of what is measured, and of any number. What a model makes of readings stays below the second, and
 #: what a reader makes of that, squares for example, remains finite.
 READING_MAX, NUMBER_MAX = 1e12, 1e30
+#: Largest offset, µm, µrad or µm/m, that any configuration permits.
+OFFSET_MAX = 5000.0
 
 SampleNumber = Annotated[int, Meta(ge=0, le=SEQ_MAX)]
 TimeNs = Annotated[int, Meta(ge=0, le=TIME_MAX_NS)]
 Reading = Annotated[float, Meta(ge=-READING_MAX, le=READING_MAX)]
 Number = Annotated[float, Meta(ge=-NUMBER_MAX, le=NUMBER_MAX)]
+OffsetValue = Annotated[float, Meta(ge=-OFFSET_MAX, le=OFFSET_MAX)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 #: Number of a record in its file, −1 before the first.
 RecordNumber = Annotated[int, Meta(ge=-1, le=2**32 - 1)]
@@ -173,7 +176,7 @@ class Offset(Message, frozen=True, kw_only=True):
     """
 
     valid_for_s: Number
-    y_offset_um: Number | None
+    y_offset_um: OffsetValue | None
     y_offset_rate_um_per_min: Number | None
     y_offset_std_um: Number | None
     state: State

@@ -14,7 +14,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from compensator.axes import FIRST
 from compensator.codes import State
-from compensator.messages import MESSAGES, EstimateMessage, Number, Offset, Status, number
+from compensator.messages import MESSAGES, EstimateMessage, Number, Offset, OffsetValue, Status, number
 
 #: Axes of a control and its tilts, each with the unit of its offset.
 UNITS: Mapping[str, str] = {"x": "um", "y": "um", "z": "um", "a": "urad", "b": "urad"}
@@ -49,7 +49,7 @@ class AxisOffset(Offset, frozen=True, kw_only=True):
     axes: list[str]
     acts_on: str | UnsetType = UNSET
     reference_mm: Number | UnsetType = UNSET
-    y_slope_um_per_m: Number | UnsetType | None = UNSET
+    y_slope_um_per_m: OffsetValue | UnsetType | None = UNSET
     y_slope_rate_um_per_m_per_min: Number | UnsetType | None = UNSET
     y_slope_std_um_per_m: Number | UnsetType | None = UNSET
     sign: Annotated[int, Meta(ge=-1, le=1)] | UnsetType = UNSET

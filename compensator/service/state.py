@@ -17,7 +17,7 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
-from compensator.messages import SEQ_MAX, UNREADABLE, TimeNs, check_numbers
+from compensator.messages import OFFSET_MAX, SEQ_MAX, UNREADABLE, TimeNs, check_numbers
 from compensator.model.covariance import may_be_covariance
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
@@ -127,7 +127,7 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     alternative: str | None
     engine: EngineState
     guards: dict[str, tuple[float, Minutes, float, Minutes]]
-    offset_um: Known
+    offset_um: float
     zero: ZeroState
     memory: Memory
     plausibility: PlausibilityState | None = None
@@ -209,13 +209,16 @@ def decode_state(data: bytes) -> CompensationState:
     if state.jumps is not None:
         engines += [branch.engine for branch in state.jumps.branches()]
     nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
+    offsets = [state.offset_um, *(one.offset for one in (state.axes or {}).values())]
+    if not all(-OFFSET_MAX <= value <= OFFSET_MAX for value in offsets):
+        raise DataError(f"state: an offset is not finite, or above {OFFSET_MAX:g}")
     numbers = [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]
     # Before the first zero there is no reference.
     references = [(one.reference.t_q_degc, one.reference.at_degc) for one in nested]
     numbers += [value for pair in references for value in pair if not all(map(math.isnan, pair))]
-    numbers += [value for one in (state.axes or {}).values() for value in (one.offset, one.base)]
+    numbers += [one.base for one in (state.axes or {}).values()]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
-        raise DataError("state: a number of the offset or of the engine is not finite, or too large to be valid")
+        raise DataError("state: a number of the engine is not finite, or too large to be valid")
     if not all(may_be_covariance(one.observer.p) for one in nested):
         raise DataError("state: the covariance of the engine cannot be one")
     return state

@@ -47,6 +47,7 @@ IMPOSSIBLE = [
     ("offset", "time_utc_ns", DIGITS, "time_utc_ns"),
     ("offset", "time_utc_ns", str(-(2**63)), "time_utc_ns"),
     ("offset", "y_offset_um", "1e308", "y_offset_um"),
+    ("offset", "y_offset_um", "5001.0", "y_offset_um"),
     ("offset", "valid_for_s", "1e400", "valid_for_s"),
     ("event", "time_utc_ns", DIGITS, "time_utc_ns"),
     ("event", "data", '{"missing":' + DIGITS + "}", "data.missing"),
@@ -61,7 +62,7 @@ LARGEST = [
     ("estimate", "y_pred_um", f"{-NUMBER_MAX:.1f}"),
     ("offset", "time_utc_ns", str(TIME_MAX_NS)),
     ("offset", "time_utc_ns", "0"),
-    ("offset", "y_offset_um", f"{NUMBER_MAX:.1f}"),
+    ("offset", "y_offset_um", "-5000.0"),
 ]
 
 
