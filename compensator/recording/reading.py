@@ -20,7 +20,6 @@ from compensator.recording.naming import is_name, order_of
 GROUP_BYTES, GROUP_RECORDS = 16_000_000, 10_000
 
 _T = TypeVar("_T")
-_EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
 _DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in ALL_MESSAGES.items()}
 #: Of a machine of several axes, whose messages name them.
 _DECODERS_OF_AXES: dict[str, msgspec.json.Decoder[Any]] = {
@@ -282,8 +281,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     began: dict[Path, str] = {}
     machines: set[str] = set()
     for path in dict.fromkeys(paths):
-        with Container(path) as container:
-            run = container.survey(whole=False).run
+        run = run_of(path)
         machines |= {run["machine"]} if "machine" in run else set()
         began[path] = run.get("file", path.name).removesuffix(".mcap")
     if len(machines) > 1:
@@ -304,7 +302,7 @@ def last_value(path: Path) -> bytes:
     """
     before_seal = value = b""
     recovered = False
-    for record, following in _linked(path):
+    for record, following in linked(path):
         before_seal, value = value, following
         recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
     return before_seal if recovered else value
@@ -318,7 +316,7 @@ def has_begun(path: Path) -> bool:
     DataError
         If it is not an MCAP file.
     """
-    return next(_linked(path), None) is not None
+    return next(linked(path), None) is not None
 
 
 def values_of(path: Path) -> set[bytes]:
@@ -327,13 +325,31 @@ def values_of(path: Path) -> set[bytes]:
     A file that is not an MCAP file has none.
     """
     try:
-        return {value for _, value in _linked(path)}
+        return {value for _, value in linked(path)}
     except DataError:
         return set()
 
 
-def _linked(path: Path) -> Iterator[tuple[RawRecord, bytes]]:
-    """Yield the first message of the chain and every record, each with the value of the chain that it makes."""
+def run_of(path: Path) -> dict[str, str]:
+    """Return what a recording says of itself in its metadata.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
+    with Container(path) as container:
+        return container.survey(whole=False).run
+
+
+def linked(path: Path) -> Iterator[tuple[RawRecord, bytes]]:
+    """Yield the first message of the chain and every record, each with the value of the chain that it makes.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
     value = b""
     with Container(path) as container, suppress(Damaged, *UNREADABLE, ValueError):
         for record in records_of(container):
@@ -347,40 +363,3 @@ def _linked(path: Path) -> Iterator[tuple[RawRecord, bytes]]:
             else:
                 value = chain.link(value, record.topic, record.body)
             yield record, value
-
-
-def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:
-    """Return a sequence number that the machine has never published.
-
-    Numbers continue after the last one on disk. Because a recording may have been removed, or the disk may not have
-    accepted the last samples, the number is also at least the number of periods since 2020: a service cannot have
-    published more samples than that.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Folder of the recordings.
-    machine : str
-        Name of the machine.
-    utc_ns : int
-        Now, ns since 1970 UTC.
-    period_s : float
-        Length of a sample, s.
-    """
-    periods = int((utc_ns - _EPOCH_2020_NS) / 1e9 // period_s)
-    return max(last_sequence(folder, machine) + 1, periods, 0)
-
-
-def last_sequence(folder: Path, machine: str) -> int:
-    """Return the highest recorded sequence number; −1 if there is none.
-
-    A file that cannot be read does not keep a service from starting: `first_sequence` does not depend on it.
-    """
-    for path in reversed(recordings(folder, machine)):
-        highest = -1
-        with suppress(DataError):
-            for message in messages(path, ("sample", "offset")):
-                highest = max(highest, message.seq)
-        if highest >= 0:
-            return highest
-    return -1

@@ -25,6 +25,7 @@ from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.head import HeadKeeper, previous_end
 from compensator.recording.live_file import TOPICS, RecordingFile
 from compensator.recording.naming import day_of, names, order_of
+from compensator.recording.numbering import first_sequence
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
 
@@ -82,6 +83,22 @@ class McapRecorder:
         #: Why the next file is opened, and name and last chain value of the previous file if known.
         self._reason, self._last_name, self._last = "start", "", b""
         self.path: Path | None = None
+
+    def first_sequence(self, utc_ns: int, period_s: float) -> int:
+        """Return the number of the first sample; remark if one in the folder cannot be a number of this machine.
+
+        Parameters
+        ----------
+        utc_ns : int
+            Now, ns since 1970 UTC.
+        period_s : float
+            Length of a sample, s.
+        """
+
+        def remark(file: str, text: str) -> None:
+            self._finisher.remark(f"{file}: {text}", RecordingData(code=RecordingCode.NOT_AS_WRITTEN, file=file))
+
+        return first_sequence(self._folder, self._machine, utc_ns, period_s, keeper=self._keeper, remark=remark)
 
     def write(
         self,

@@ -12,7 +12,6 @@ from compensator.errors import ConfigError
 from compensator.events import EventKind, Note
 from compensator.recording.finishing import Retention
 from compensator.recording.live_file import topics_of
-from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
 from compensator.service.axes import planned_outputs
 from compensator.service.compensation import Outcome
@@ -126,7 +125,7 @@ async def run_service(
         checkpointed = checkpoint.read(config.limits.offset_max_um, further_max)
         resumed = resume(loaded, setup.model, checkpointed)
         loop = loop_parts(setup, resumed, diagnose)
-        first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)
+        first = recorder.first_sequence(clock.utc_ns(), setup.model.period_s)
         compensation = resumed.compensation
         # As before on a machine that does not watch for jumps: its recordings stay the same.
         watches = config.guards.suspect_jumps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import msgspec
 
 from compensator.messages import Chain, Seal, encode
 from compensator.recording import chain
-from compensator.recording.container import Contents
+from compensator.recording.container import Attachment, Contents
 from compensator.recording.live_file import RecordingFile
 from compensator.recording.reading import last_value
 from tests.audit.tampering import Line, find, lines_of
@@ -48,6 +48,7 @@ def rechained(
     before: bytes | None = None,
     finished: bool = False,
     cut: int = 0,
+    parts: Mapping[str, Attachment] | None = None,
 ) -> None:
     """Write a recording again as the recorder writes a live one, with a chain that fits.
 
@@ -63,8 +64,11 @@ def rechained(
         Whether it gets its end.
     cut : int
         Bytes to remove from its end, so that it is torn.
+    parts : mapping of str to Attachment, optional
+        Attachments in the place of its own.
     """
     lines, contents = lines_of(path)
+    contents.attachments.update(parts or {})
     made = _grouped(edit(lines), contents, before)
     path.unlink()
     machine = contents.run["machine"]

@@ -21,10 +21,10 @@ from compensator.recording.chain import NOTHING
 from compensator.recording.container import Container, Damaged
 from compensator.recording.finishing import Finisher, Retention, compact
 from compensator.recording.head import KEPT, LONGEST, HeadKeeper, read_head
+from compensator.recording.numbering import first_sequence
 from compensator.recording.reading import (
     GROUP_BYTES,
     GROUP_RECORDS,
-    first_sequence,
     groups_of,
     recordings,
     records_of,

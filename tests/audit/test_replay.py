@@ -17,7 +17,8 @@ from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset
 from compensator.model.model_file import parse_model
 from compensator.recording import recorder as recorder_module
-from compensator.recording.reading import first_sequence, read_messages, recordings
+from compensator.recording.numbering import first_sequence
+from compensator.recording.reading import read_messages, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.daemon import Daemon
 from compensator.service.transfer.restart import resume

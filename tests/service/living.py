@@ -18,7 +18,8 @@ from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.live_file import topics_of
-from compensator.recording.reading import first_sequence, recordings
+from compensator.recording.numbering import first_sequence
+from compensator.recording.reading import recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon

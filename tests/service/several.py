@@ -21,7 +21,8 @@ from compensator.model.thermal_model import Path as ModelPath
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import TransferFunction
 from compensator.recording.live_file import topics_of
-from compensator.recording.reading import first_sequence, recordings
+from compensator.recording.numbering import first_sequence
+from compensator.recording.reading import recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.axes import planned_outputs
 from compensator.service.compensation import Outcome, model_of

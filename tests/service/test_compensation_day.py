@@ -12,7 +12,8 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
-from compensator.recording.reading import decode, first_sequence, last_sequence, read_messages, recordings
+from compensator.recording.numbering import first_sequence, last_sequence
+from compensator.recording.reading import decode, read_messages, recordings
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
 from tests.audit.tampering import end_of_chain

@@ -23,7 +23,8 @@ from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.recording import recorder as recorder_module
-from compensator.recording.reading import decode, first_sequence, read_messages, recordings
+from compensator.recording.numbering import first_sequence
+from compensator.recording.reading import decode, read_messages, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.recording.signature import Signer
 from compensator.service.compensation import Outcome
