@@ -31,6 +31,7 @@ from compensator.receiver import Receiver, ReceiverError, load_settings
 from compensator.service.transfer.model_store import check_model
 from tests.audit.made import CONFIG, Service
 from tests.fuzz.attacked_receiver import Attack
+from tests.fuzz.forged_numbers import NAME, attempt_start, forged
 from tests.fuzz.mutation import mutated
 from tests.fuzz.payloads import number
 
@@ -237,6 +238,26 @@ def _memory_mb(name: str) -> float:
     return int(line.split()[1]) / 1024.0
 
 
+def forged_numbers(rng: random.Random, folder: Path) -> None:
+    """A service starts with what is on record, and each command has a result or names the place in one line."""
+    attempt_start(rng, folder)
+    name = f"it/{NAME}"
+    (folder / "it").mkdir()
+    forged(rng, folder / name)
+    command(
+        folder,
+        *rng.choice(
+            (
+                ("replay", name),
+                ("replay", name, "--model", "quill"),
+                ("export", name, "--out", "out.csv"),
+                ("report", name, "--out", "out.html"),
+                ("diagnose", name, "--model", "quill", "--out", "found"),
+            )
+        ),
+    )
+
+
 def receiver_settings(rng: random.Random, folder: Path) -> None:
     """Settings of a receiver are refused, or it runs with them, whatever its files are."""
     names = ('"s.json"', '"/"', '"\\u0000"', f'"{"x" * 300}"', '"none/s.json"', '"receiver.toml"', '""')
@@ -268,6 +289,7 @@ KINDS: dict[str, Callable[[random.Random, Path], None]] = {
     "tables": table,
     "files that are none": no_file,
     "recordings": recording,
+    "recordings with forged numbers": forged_numbers,
     "settings of a receiver": receiver_settings,
 }
 
