@@ -76,17 +76,17 @@ class _LastFile:
 
     def add(self, step: RecordedStep) -> float:
         """Process one group; return the offset that was published with it, µm; NaN if there was none."""
+        offset, values = step.offset, step.further  # nothing of a group counts with a record that cannot be read
         self.samples += step.sample is not None
         offset_um, held, failed = self.handover.offset_um, self.handover.operator_hold, self.handover.internal_error
         for event in step.events:
             command = command_of(event) if event.kind == EventKind.COMMAND else ""
             held = command == CommandName.HOLD or (held and command != CommandName.RESUME)
             failed = event.kind == EventKind.ERROR or (failed and command != CommandName.RESUME)
-        offset = step.offset
         published = number(offset.y_offset_um) if offset is not None else math.nan
         # Without a state only the offsets show a hold from an earlier file.
         reasons = offset.reasons if offset is not None else []
-        further = {name: value for name, value in step.further.items() if not math.isnan(value)}
+        further = {name: value for name, value in values.items() if not math.isnan(value)}
         self.handover = Handover(
             offset_um=offset_um if math.isnan(published) else published,
             operator_hold=held or Reason.OPERATOR_HOLD in reasons,
@@ -135,7 +135,7 @@ def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
                 last.read_state(resumed)
             changes = _changes(last, loaded, model)
             compensation = Compensation(config, model)
-            differing, why = _run_again(last, compensation, restore=not changes)
+            differing, why = _run_again(last, compensation, resumed, restore=not changes)
         except CompensatorError as error:
             resumed.note(f"a recording cannot be used: {error}")
             continue
@@ -161,8 +161,10 @@ def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list
     return changes
 
 
-def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) -> tuple[int, str]:
+def _run_again(last: _LastFile, compensation: Compensation, resumed: Resumed, *, restore: bool) -> tuple[int, str]:
     """Read the last file; with `restore`, replay it from its state.
+
+    A record that no service wrote ends it, as a torn end does: what came before it was published.
 
     Returns
     -------
@@ -177,19 +179,24 @@ def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) ->
             compensation.restore(last.opening["state.json"])
     except DataError as error:
         why = str(error)
-    for step in steps_of(last.path):
-        published = last.add(step)
-        if not restore or why:
-            continue
-        try:
-            result = apply(compensation, step)
-        except DataError as error:
-            why = str(error)
-            continue
-        if isinstance(result, Outcome) and "offset" in step.records:
-            # The daemon adds reasons when the disk fails; only the numbers are the compensation's.
-            computed = number(result.offset.y_offset_um)
-            differing += computed != published and not (math.isnan(computed) and math.isnan(published))
+    try:
+        for step in steps_of(last.path):
+            published = last.add(step)
+            if not restore or why:
+                continue
+            try:
+                result = apply(compensation, step)
+            except DataError as error:
+                why = str(error)
+                continue
+            if isinstance(result, Outcome) and "offset" in step.records:
+                # The daemon adds reasons when the disk fails; only the numbers are the compensation's.
+                computed = number(result.offset.y_offset_um)
+                differing += computed != published and not (math.isnan(computed) and math.isnan(published))
+    except DataError as error:
+        if not last.samples:
+            raise
+        resumed.note(f"a recording is used up to a record that cannot be: {error}")
     return differing, why
 
 
