@@ -365,7 +365,7 @@ def broken(state: bytes, path: tuple[str | int, ...], value: Any) -> bytes:
     [
         (("jumps", "beside", "believing", "engine", "observer", "x"), None),
         (("jumps", "phase"), "none"),
-        (("jumps", "beside", "shifts_k"), {"y_um": 1.0}),
+        (("jumps", "beside", "jumps"), {"y_um": {"size_k": 1.0, "std_k": 1.0, "first_k": 1.0}}),
         (("memory", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
         (("jumps", "shifted", "estimate", "outputs"), [{"value": 1.0, "std": 1.0, "rate_per_min": 0.0}]),
         (("jumps", "shifted", "engine", "reference", "t_q_degc"), "nan"),

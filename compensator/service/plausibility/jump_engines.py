@@ -11,7 +11,7 @@ from compensator.arrays import NAN
 from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
-from compensator.service.plausibility.jump_state import Branch, JumpState, Phase
+from compensator.service.plausibility.jump_state import Branch, ChannelJump, JumpState, Phase
 
 #: A value counts as expected within this number of standard deviations.
 NEAR = 4.0
@@ -119,14 +119,14 @@ class JumpEngines:
         """
         believing, shifted = (_run_of(model, branch) for branch in (state.believing, state.shifted))
         are_both = believing is not None and shifted is not None
-        is_open = bool(state.shifts_k)
-        if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.shifts_k) <= set(TEMPERATURES):
+        is_open = bool(state.jumps)
+        if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.jumps) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
-        if not set(state.shifts_k) == set(state.first_k) == set(state.shift_std_k) <= set(state.last):
-            raise ValueError("state of a jump whose channels differ")
+        if not set(state.jumps) <= set(state.last):
+            raise ValueError("state of a jump of a channel without a value")
         beside = state.beside
         if beside is not None and not (
-            state.is_suspect and len(state.shifts_k) == 1 and not set(beside.shifts_k) & set(state.shifts_k)
+            state.is_suspect and len(state.jumps) == 1 and not set(beside.jumps) & set(state.jumps)
         ):
             raise ValueError("state of a jump beside none")
         if believing is None or shifted is None:
@@ -238,14 +238,14 @@ class JumpEngines:
             if math.isnan(value):
                 values[name] = NAN
                 continue
-            if name in state.shifts_k:
+            if name in state.jumps:
                 move = _move(state, name, difference, std, change_k[name], least_k, is_fast=name in jumped)
             else:
                 move = _Move.JUMPS if name in jumped else _Move.BACK
             if move == _Move.BACK:
-                values[name] = value - state.left_k.get(name, 0.0)
+                values[name] = value - (state.jumps[name].left_k if name in state.jumps else 0.0)
             elif move == _Move.FOLLOWS:
-                values[name] = value - state.shifts_k[name]
+                values[name] = value - state.jumps[name].size_k
             else:
                 values[name] = NAN
             if move in {_Move.JUMPS, _Move.GOES_ON}:
@@ -255,7 +255,7 @@ class JumpEngines:
 
     def goes_away(self, state: JumpState, offered: Mapping[str, float]) -> bool:
         """Return whether the channels that have jumped move further away from what the shifted engine expects."""
-        for name in state.shifts_k:
+        for name in state.jumps:
             expected, _ = expected_value(self.shifted.engine, name, offered["at_degc"])
             last = state.last.get(name, NAN)
             if not (offered[name] - last) * (last - expected) > 0.0:
@@ -266,7 +266,7 @@ class JumpEngines:
         """Return whether none is missing, and those that have jumped are where the shifted engine expects them."""
         if any(map(math.isnan, offered.values())):
             return False
-        for name in state.shifts_k:
+        for name in state.jumps:
             expected, std = expected_value(self.shifted.engine, name, offered["at_degc"])
             if abs(offered[name] - expected) > NEAR * std:
                 return False
@@ -275,7 +275,7 @@ class JumpEngines:
     def fits(self, engine: Engine, state: JumpState, offered: Mapping[str, float]) -> bool:
         """Return whether an engine expects the channels that have jumped rather than the shifted one does."""
         ratio = 0.0
-        for name in state.shifts_k:
+        for name in state.jumps:
             if not math.isnan(offered[name]):
                 for one, sign in ((engine, 1.0), (self.shifted.engine, -1.0)):
                     expected, std = expected_value(one, name, offered["at_degc"])
@@ -332,23 +332,24 @@ def _move(
     state: JumpState, name: str, difference: float, std: float, change_k: float, least_k: float, *, is_fast: bool
 ) -> _Move:
     """Find what a channel that has jumped does now; its counts are kept in the state."""
-    shift = state.shifts_k[name]
+    jump = state.jumps[name]
+    shift = jump.size_k
     # A heat that is switched may bring T_Q back for a moment.
-    unsure = min(state.back.get(name, 0), BACK_SAMPLES) if name == "t_q_degc" else 0
+    unsure = min(jump.back, BACK_SAMPLES) if name == "t_q_degc" else 0
     if state.is_air:  # AT on its way back widens what is expected, not where it was
         is_back = abs(difference) <= (_RETURNED * abs(shift) if shift else NEAR * std)
     else:
-        is_back = _has_returned(difference, std, shift, state.first_k[name])
+        is_back = _has_returned(difference, std, shift, jump.first_k)
         # One sample after others without it may have been wrong: what is expected is as uncertain as it was then.
         is_back |= not (state.is_suspect or is_unsteady(state)) and abs(difference) <= _RETURNED * abs(shift)
-    back = state.back.get(name, 0)
+    back = jump.back
     is_settling = 0 < back < needed_samples(state) and not state.is_air
-    if is_settling and abs(difference - state.left_k.get(name, 0.0)) > max(NEAR * std, 0.5 * least_k):
+    if is_settling and abs(difference - jump.left_k) > max(NEAR * std, 0.5 * least_k):
         back = 0  # what is left of a jump is where the channel comes to rest
-    state.back[name] = back + 1 if is_back else 0
-    if state.back[name] <= 1:
+    jump.back = back + 1 if is_back else 0
+    if jump.back <= 1:
         is_part = is_back and abs(difference) > max(0.0 if state.is_air else NEAR * std, least_k)
-        state.left_k[name] = difference if is_part else 0.0
+        jump.left_k = difference if is_part else 0.0
     if is_back:
         state.moving = 0
         return _Move.BACK
@@ -369,17 +370,19 @@ def _move(
 
 def _enter_jump(state: JumpState, name: str, difference: float, std: float, *, goes_on: bool) -> None:
     """Enter a jump, or the next step of one, in the state."""
-    is_again = state.is_suspect and name in state.shifts_k
+    before = state.jumps.get(name)
+    is_again = state.is_suspect and before is not None
     state.steps += is_again and goes_on
     if is_again and not goes_on:
         state.again[name] = state.again.get(name, 0) + 1
-    state.shifts_k[name], state.shift_std_k[name], state.back[name] = difference, std, 0
     if state.phase == Phase.AIR_RETURNED:
         state.phase = Phase.AIR
     # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect channel that had
     # come to rest has jumped again.
-    first_k = state.first_k.get(name, difference)
-    state.first_k[name] = first_k if state.is_suspect and not goes_on else difference
+    is_further = before is not None and state.is_suspect and not goes_on
+    first_k = before.first_k if before is not None and is_further else difference
+    left_k = before.left_k if before is not None else 0.0
+    state.jumps[name] = ChannelJump(size_k=difference, std_k=std, first_k=first_k, left_k=left_k)
 
 
 def is_unsteady(state: JumpState) -> bool:
@@ -396,7 +399,7 @@ def moves(state: JumpState, offered: Mapping[str, float], change_k: Mapping[str,
     """Return whether a loose contact jumps from the last sample to this one, or is open."""
     return any(
         state.unseen.get(name, 0) >= UNSEEN_SAMPLES or abs(offered[name] - state.last.get(name, NAN)) > change_k[name]
-        for name in state.shifts_k
+        for name in state.jumps
     )
 
 
@@ -415,12 +418,14 @@ def count_held(state: JumpState, engine: Engine, at_degc: float, least_k: float)
         Smallest jump that is looked for, K.
     """
     expected, std = expected_value(engine, "at_degc", NAN)
-    first_k, difference = state.first_k.get("at_degc", NAN), at_degc - expected
+    jump, difference = state.jumps.get("at_degc"), at_degc - expected
     # Air goes back little by little. A couple that is half pushed in jumps back, and part of the way.
-    is_air = abs(difference) <= least_k or (
-        state.shifts_k.get("at_degc") == first_k and not state.left_k.get("at_degc")
+    is_back = (
+        jump is not None
+        and state.is_at_alone
+        and (abs(difference) <= least_k or (jump.size_k == jump.first_k and not jump.left_k))
+        and _has_returned(difference, std, jump.first_k, jump.first_k)
     )
-    is_back = is_air and list(state.shifts_k) == ["at_degc"] and _has_returned(difference, std, first_k, first_k)
     state.at_held = state.at_held + 1 if is_back else 0
 
 
@@ -432,8 +437,8 @@ def expected_value(engine: Engine, name: str, at_degc: float) -> tuple[float, fl
 
 def shifts_against(engine: Engine, state: JumpState) -> dict[str, float]:
     """Return by how much the last values of the channels that have jumped differ from what an engine expects, K."""
-    at_degc = NAN if "at_degc" in state.shifts_k else state.last.get("at_degc", NAN)
-    return {name: state.last[name] - expected_value(engine, name, at_degc)[0] for name in state.shifts_k}
+    at_degc = NAN if "at_degc" in state.jumps else state.last.get("at_degc", NAN)
+    return {name: state.last[name] - expected_value(engine, name, at_degc)[0] for name in state.jumps}
 
 
 def grown(estimate: Estimate, at_zero: Estimate | None) -> list[float]:

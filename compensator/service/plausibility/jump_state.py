@@ -47,6 +47,30 @@ class Branch(msgspec.Struct, kw_only=True, frozen=True):
     at_zero: Estimate | None = None
 
 
+class ChannelJump(msgspec.Struct, kw_only=True):
+    """What a channel that has jumped shows.
+
+    Parameters
+    ----------
+    size_k : float
+        Measured − expected, K.
+    std_k : float
+        Standard deviation of what was expected at the last jump, K.
+    first_k : float
+        The first jump, K.
+    back : int
+        Consecutive samples for which it has been back.
+    left_k : float
+        If it is back: what is left of its jump, K; 0 where that is too little to be one.
+    """
+
+    size_k: Known
+    std_k: Known
+    first_k: Known
+    back: Count = 0
+    left_k: Known = 0.0
+
+
 class JumpState(msgspec.Struct, kw_only=True):
     """State of the watch.
 
@@ -54,12 +78,8 @@ class JumpState(msgspec.Struct, kw_only=True):
     ----------
     level_um : float
         Mean of measured Y − prediction over the last samples, or Y at a zero since a jump, µm; of the watch as a whole.
-    shifts_k : dict of str to float
-        By channel that has jumped: measured − expected, K. Empty if none has.
-    shift_std_k : dict of str to float
-        Standard deviation of what was expected at their last jumps, K.
-    first_k : dict of str to float
-        The first jump of each of them, K.
+    jumps : dict of str to ChannelJump
+        By channel that has jumped. Empty if none has.
     steps : int
         Further samples that these jumps have taken.
     again : dict of str to int
@@ -72,10 +92,6 @@ class JumpState(msgspec.Struct, kw_only=True):
         Samples since the last jump.
     ratio : float
         Log likelihood ratio of the believing over the shifted engine.
-    back : dict of str to int
-        Consecutive samples for which each channel has been back.
-    left_k : dict of str to float
-        By channel that is back: what is left of its jump, K; 0 where that is too little to be one.
     moving : int
         Consecutive samples for which AT of `Phase.AIR` has been on its way back.
     at_held : int
@@ -101,9 +117,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     """
 
     level_um: float = NAN
-    shifts_k: dict[str, Known] = {}
-    shift_std_k: dict[str, Known] = {}
-    first_k: dict[str, Known] = {}
+    jumps: dict[str, ChannelJump] = {}
     steps: Count = 0
     again: dict[str, Count] = {}
     quiet: dict[str, Count] = {}
@@ -114,8 +128,6 @@ class JumpState(msgspec.Struct, kw_only=True):
     unseen: dict[str, Count] = {}
     samples: Count = 0
     ratio: Known = 0.0
-    back: dict[str, Count] = {}
-    left_k: dict[str, Known] = {}
     moving: Count = 0
     at_held: Count = 0
     y_for: Count = 0
@@ -150,18 +162,35 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def keep_what_is_left(self) -> None:
         """Go on with what is left of the jumps of the channels that are back; of AT alone even if that is nothing."""
-        left_k = {name: left for name, left in self.left_k.items() if left}
-        self.shifts_k = left_k or dict.fromkeys(self.shifts_k, 0.0)
-        self.first_k, self.left_k = dict(self.shifts_k), {}
+        left = {name: jump for name, jump in self.jumps.items() if jump.left_k} or self.jumps
+        self.jumps = {
+            name: ChannelJump(size_k=jump.left_k, std_k=jump.std_k, first_k=jump.left_k) for name, jump in left.items()
+        }
         self.start_counts()
 
     def kept_k(self) -> dict[str, float]:
         """Return by how much each channel is off now, K: what is left of its jump where it is back."""
-        return {name: self.left_k.get(name, 0.0) if self.back.get(name) else k for name, k in self.shifts_k.items()}
+        return {name: jump.left_k if jump.back else jump.size_k for name, jump in self.jumps.items()}
+
+    def is_back(self, samples: int) -> bool:
+        """Return whether all channels have been back for so many samples."""
+        return all(jump.back >= samples for jump in self.jumps.values())
+
+    @property
+    def leaves_something(self) -> bool:
+        """Whether something is left of the jump of a channel that is back."""
+        return any(jump.left_k for jump in self.jumps.values())
+
+    @property
+    def is_at_alone(self) -> bool:
+        """Whether AT alone has jumped."""
+        return list(self.jumps) == ["at_degc"]
 
     def start_counts(self) -> None:
         """Count consecutive samples from here on."""
-        self.back, self.at_held, self.moving = {}, 0, 0
+        self.at_held = self.moving = 0
+        for jump in self.jumps.values():
+            jump.back = 0
 
     def start_evidence(self) -> None:
         """Count the evidence from here on."""
@@ -184,7 +213,7 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def ended(self) -> JumpState:
         """Return the state when all channels are used again."""
-        quiet = dict.fromkeys(self.shifts_k, 0) if self.is_suspect else {}
+        quiet = dict.fromkeys(self.jumps, 0) if self.is_suspect else {}
         return JumpState(unseen=self.unseen, again=self.again, quiet=self.quiet | quiet)
 
     def count_quiet(self, samples: int = 1) -> None:
@@ -198,7 +227,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     @property
     def most_again(self) -> int:
         """How often the loosest of these channels has jumped after its first jump."""
-        return max((self.again.get(name, 0) for name in self.shifts_k), default=0)
+        return max((self.again.get(name, 0) for name in self.jumps), default=0)
 
     def without_engines(self) -> JumpState:
         """Return a copy without the states of the engines and of the watch beside."""

@@ -68,10 +68,10 @@ def suspected(
         Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
     needed = needed_samples(state)
-    if all(state.back.get(name, 0) >= needed and not math.isnan(offered[name]) for name in state.shifts_k):
-        if any(state.left_k.values()) and is_unsteady(state):
+    if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
+        if state.leaves_something and is_unsteady(state):
             return _settle(engine, engines, state, offered) if is_alone else Verdict()
-        if any(state.left_k.values()):
+        if state.leaves_something:
             return _keep_what_is_left(engine, engines, state, offered, is_alone=is_alone)
         found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
         return msgspec.structs.replace(found, has_returned=True)
@@ -89,44 +89,44 @@ def _keep_what_is_left(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], *, is_alone: bool = True
 ) -> Verdict:
     """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
-    used = {name: offered[name] for name in state.shifts_k if not state.left_k.get(name)}
+    used = {name: offered[name] for name, jump in state.jumps.items() if not jump.left_k}
     # How far it had jumped was as uncertain as what was expected then.
-    is_certain = any(abs(left) > NEAR * state.shift_std_k.get(name, 0.0) for name, left in state.left_k.items())
+    is_certain = any(abs(jump.left_k) > NEAR * jump.std_k for jump in state.jumps.values())
     state.keep_what_is_left()
     engines.believing.estimate = estimate = engines.give(engine, engines.shifted)
     engines.believe_from_shifted()
     state.suspect()
     if is_alone and not is_certain:
         state.phase = Phase.UNCONFIRMED
-        notes = [unconfirmed_note(name, left, LEFT) for name, left in state.shifts_k.items()]
-        return Verdict(estimate, notes, {name: offered[name] for name in state.shifts_k} | used)
+        notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
+        return Verdict(estimate, notes, {name: offered[name] for name in state.jumps} | used)
     then = f"{LEFT}, and is not used until its new value is confirmed"
-    notes = [jump_note(name, left, then) for name, left in state.shifts_k.items()]
+    notes = [jump_note(name, jump.size_k, then) for name, jump in state.jumps.items()]
     return Verdict(estimate, notes, used)
 
 
 def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Verdict:
     """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
     notes = []
-    for name in state.shifts_k:
+    for name, jump in state.jumps.items():
         expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
-        state.shifts_k[name] = offered[name] - expected
-        notes.append(unconfirmed_note(name, state.shifts_k[name], RESTED))
+        jump.size_k = offered[name] - expected
+        notes.append(unconfirmed_note(name, jump.size_k, RESTED))
     estimate = engines.give(engine, engines.believing)
     state.phase = Phase.UNCONFIRMED
     state.start_evidence()
-    return Verdict(estimate, notes, {name: offered[name] for name in state.shifts_k})
+    return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
 
 
 def _accept(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str
 ) -> Verdict:
-    names = list(state.shifts_k)
+    names = list(state.jumps)
     notes = [
         Note(
             EventKind.PLAUSIBILITY,
             f"{NAMES[name]} {how}",
-            {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": state.shifts_k[name]},
+            {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": state.jumps[name].size_k},
         )
         for name in names
     ]
@@ -142,34 +142,34 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
     engine, engines, state, offered
         As `suspected` has them.
     """
-    is_refuted, only_at = is_unlikely(state), list(state.shifts_k) == ["at_degc"]
-    is_back = all(state.back.get(name, 0) > 0 for name in state.shifts_k)
+    is_refuted, only_at = is_unlikely(state), state.is_at_alone
+    is_back = state.is_back(1)
     if only_at and is_refuted and not is_back and not state.is_unconfirmed:
         state.phase = Phase.AIR
-        return Verdict(notes=[unconfirmed_note("at_degc", state.shifts_k["at_degc"], AIR)])
+        return Verdict(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
     # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
     is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
     if state.is_unconfirmed:
         by = confirmed_by(state)
         if by:
             return _accept(engine, engines, state, offered, None, f"is confirmed: {by} with it")
-        if all(state.back.get(name, 0) >= needed_samples(state) for name in state.shifts_k):
-            if only_at and state.left_k.get("at_degc"):
+        if state.is_back(needed_samples(state)):
+            if only_at and state.leaves_something:
                 state.keep_what_is_left()
-            elif (only_at or not is_unsteady(state)) and not any(state.left_k.values()) and engines.agree():
+            elif (only_at or not is_unsteady(state)) and not state.leaves_something and engines.agree():
                 return _accept(engine, engines, state, offered, None, "has returned to what was expected before")
         # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
         is_refuted |= is_contradicted(state) and not is_unsteady(state)
     if is_refuted:
         estimate = engines.give(engine, engines.shifted)
         if not is_back:
-            notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
+            notes = [jump_note(name, jump.size_k) for name, jump in state.jumps.items()]
             state.suspect()
             return Verdict(estimate, notes)
-        if any(state.left_k.values()) and not only_at:
+        if state.leaves_something and not only_at:
             return _keep_what_is_left(engine, engines, state, offered)
-        notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
-        if not only_at or (engines.agree() and not any(state.left_k.values())):
+        notes = [jump_note(name, jump.size_k, "and has returned") for name, jump in state.jumps.items()]
+        if not only_at or (engines.agree() and not state.leaves_something):
             return Verdict(estimate, notes, ends=True)
         # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
         engines.swap()

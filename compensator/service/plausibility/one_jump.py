@@ -104,18 +104,18 @@ class OneJump:
     @property
     def is_open(self) -> bool:
         """Whether a channel has jumped, or may have."""
-        return bool(self.state.shifts_k)
+        return bool(self.state.jumps)
 
     @property
     def suspects(self) -> tuple[str, ...]:
         """Channels that are not used."""
-        own = tuple(self.state.shifts_k) if self.state.is_suspect else ()
+        own = tuple(self.state.jumps) if self.state.is_suspect else ()
         return own + (self._beside.suspects if self._beside is not None else ())
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
         """Channels that are used, and of which nothing confirms that they have kept their zero."""
-        own = tuple(self.state.shifts_k) if self.state.is_unconfirmed else ()
+        own = tuple(self.state.jumps) if self.state.is_unconfirmed else ()
         return own + (self._beside.unconfirmed if self._beside is not None else ())
 
     def doubts(self, used: Estimate | None) -> list[float]:
@@ -240,7 +240,7 @@ class OneJump:
         state, beside = self.state, self._beside
         names, keeps = self.suspects, state.phase == Phase.SUSPECT_AFTER_USE or state.at_held > 0
         if state.at_held > 0:  # what it has shown was the air, and the engine without it goes on
-            shifts = dict.fromkeys(state.shifts_k, 0.0)
+            shifts = dict.fromkeys(state.jumps, 0.0)
         elif keeps:  # what the engine has gone on from after its use stays; its estimate does, too
             shifts = shifts_against(engine, state)
         else:
@@ -340,15 +340,15 @@ class OneJump:
     ) -> tuple[list[str], list[Note]]:
         """Return the channels that jump in this sample, and events; a watch begins with the first."""
         state, engines, jumped, notes = self.state, self._engines, fast, list[Note]()
-        if engines is not None and is_unsteady(state) and set(fast) <= set(state.shifts_k):
+        if engines is not None and is_unsteady(state) and set(fast) <= set(state.jumps):
             if fast or moves(state, offered, self._setup.change_k):
                 notes = self._unsettle(engine, engines, offered)
         elif engines is not None and fast and not state.is_suspect:
-            notes = [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if name not in fast]
+            notes = [jump_note(name, jump.size_k) for name, jump in state.jumps.items() if name not in fast]
             self._use_no_longer(engine, engines, offered)
         elif fast and not state.is_suspect:
             self._begin(engine, Phase.SUSPECT, fast)
-        elif not state.shifts_k:
+        elif not state.jumps:
             hidden = self._unexpected(engine, offered, seen_again)
             jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
             if jumped:
@@ -358,8 +358,8 @@ class OneJump:
             if state.is_air and "t_q_degc" in self._watchable(engine, offered):
                 self._question_both()
                 jumped = ["t_q_degc", *jumped]
-        if self.state.shifts_k:
-            known = {*jumped, *self.state.shifts_k}
+        if self.state.jumps:
+            known = {*jumped, *self.state.jumps}
             unexpected = self._unexpected(engine, offered, seen_again)
             more = [name for name in unexpected if name not in known and not self._is_for_beside(name)]
             if more and self.state.is_watched:
@@ -388,13 +388,13 @@ class OneJump:
         if state.is_suspect:
             self._believe_anew(engine, engines, offered)
             state.start_evidence()
-            return [jump_note(name, state.shifts_k[name]) for name in told]
+            return [jump_note(name, state.jumps[name].size_k) for name in told]
         if not state.is_unconfirmed:
             return []
         when = {name: UNSEEN if name in unseen else BESIDE for name in fed.jumped}
         if state.is_air:
             when["at_degc"] = AIR
-        return [unconfirmed_note(name, state.shifts_k[name], when[name]) for name in fed.jumped]
+        return [unconfirmed_note(name, state.jumps[name].size_k, when[name]) for name in fed.jumped]
 
     def _verdict(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Verdict:
         if not self.state.is_suspect:
@@ -426,7 +426,7 @@ class OneJump:
         at_zero, before = self.zero_in_use, self.state
         self.state, self._engines, self._beside = beside.state, beside._engines, None
         self.state.again = before.again | self.state.again
-        self.state.quiet = before.quiet | self.state.quiet | dict.fromkeys(before.shifts_k, 0)
+        self.state.quiet = before.quiet | self.state.quiet | dict.fromkeys(before.jumps, 0)
         self.state.last, self.state.unseen = before.last, before.unseen
         if self._engines is not None:
             self._engines.take_zero(at_zero)
@@ -448,8 +448,8 @@ class OneJump:
 
     def _is_for_beside(self, name: str) -> bool:
         """Return whether the watch beside judges a channel: the other one, while one alone is suspect."""
-        shifts = self.state.shifts_k
-        return self.state.is_suspect and len(shifts) == 1 and name not in shifts
+        jumps = self.state.jumps
+        return self.state.is_suspect and len(jumps) == 1 and name not in jumps
 
     def _judge_beside(
         self,
@@ -473,7 +473,7 @@ class OneJump:
             self._beside.state.quiet = {name: n for name, n in self.state.quiet.items() if name in names}
             self._beside._at_zero = engines.shifted.at_zero
         # What is left of a jump is a guess, by what was expected beside this very channel.
-        as_measured = {*names, *(name for name, samples in self.state.back.items() if samples)}
+        as_measured = {*names, *(name for name, jump in self.state.jumps.items() if jump.back)}
         values = {name: (measured if name in as_measured else fed.values)[name] for name in TEMPERATURES}
         fast = [name for name in fast if name in names]
         if names == ["t_q_degc"] and not fast and not self._beside.is_open and self._is_expected(engines, measured):
@@ -518,13 +518,13 @@ class OneJump:
             state.samples = 0
             return []
         state.at_held = 0
-        state.again |= {name: state.again.get(name, 0) + 1 for name in state.shifts_k}
+        state.again |= {name: state.again.get(name, 0) + 1 for name in state.jumps}
         if state.is_suspect:
             self._believe_anew(engine, engines, offered)
             state.start_evidence()
             return []
         self._use_no_longer(engine, engines, offered)
-        return [jump_note(name, shift_k) for name, shift_k in state.shifts_k.items() if not math.isnan(offered[name])]
+        return [jump_note(name, jump.size_k) for name, jump in state.jumps.items() if not math.isnan(offered[name])]
 
     # ------------------------------------------------------------------ signs
 
@@ -546,9 +546,9 @@ class OneJump:
 
     def _going_on(self, engines: JumpEngines, offered: Mapping[str, float]) -> list[str]:
         """Return the watched channels that go on to move as nothing explains: a jump may take some samples."""
-        shifts = self.state.shifts_k
-        less = {name: value - shifts.get(name, 0.0) for name, value in offered.items()}
-        return [name for name in self._watchable(engines.shifted.engine, less) if name in shifts]
+        jumps = self.state.jumps
+        less = {name: value - (jumps[name].size_k if name in jumps else 0.0) for name, value in offered.items()}
+        return [name for name in self._watchable(engines.shifted.engine, less) if name in jumps]
 
     def _seen_again(self, measured: Mapping[str, float]) -> list[str]:
         """Return the channels that are seen again after samples without them, and count such samples."""
@@ -558,7 +558,7 @@ class OneJump:
 
 
 def _others(state: JumpState) -> tuple[str, ...]:
-    return tuple(name for name in TEMPERATURES if name not in state.shifts_k)
+    return tuple(name for name in TEMPERATURES if name not in state.jumps)
 
 
 def _moved(before: Estimate | None, now: Estimate | None) -> tuple[Estimate, Estimate] | None:
