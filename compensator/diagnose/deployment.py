@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensator.arrays import Mask
 from compensator.diagnose.findings import Findings, by_channels, in_free_run
 from compensator.diagnose.fit import late_term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.held_out import HeldOut
-from compensator.diagnose.outcome import rms_of
+from compensator.diagnose.outcome import FOLDS, rms_of
 
 #: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor, or the data that were
 #: searched are in free run. Where the base's paths are fitted anew each block knows less of them than the whole.
@@ -94,7 +95,7 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
         found=found,
         effects=effects,
         held_out=held_out,
-        contradicted=_is_contradicted(found, held_out),
+        contradicted=_is_contradicted(found, held_out, _foretold(found)),
         worse_um=_worse_in_free_run(found),
     )
     return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
@@ -183,7 +184,7 @@ def _by_names_alone(found: Findings, held_out: HeldOut) -> tuple[Findings, HeldO
     """
     alone = dataclasses.replace(held_out, named=held_out.places, whole=held_out.places)
     judged = found.terms and found.explains and not found.search.evidence.free_paths
-    if not judged or not _is_contradicted(found, held_out) or _is_contradicted(found, alone):
+    if not judged or not _is_contradicted(found, held_out) or _is_contradicted(found, alone, _foretold(found)):
         return found, held_out
     return dataclasses.replace(found, remainder=None, belongs=False), alone
 
@@ -193,14 +194,31 @@ def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
     return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
 
 
-def _is_contradicted(found: Findings, held_out: HeldOut) -> bool:
+def _is_contradicted(found: Findings, held_out: HeldOut, *also: Mask) -> bool:
     """Return whether held-out blocks contradict what was found; few values do not decide that.
 
-    Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
+    Where every block holds an event of its own, none foretells another: only a clear contradiction counts, by all
+    samples and by those of the further masks.
     """
     evidence = found.search.evidence
     factor = CONTRADICTS_ANEW if evidence.free_paths else CONTRADICTS
-    return not evidence.is_sparse and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
+    masks = (np.ones(evidence.used.size, dtype=bool), *also)
+    return not evidence.is_sparse and all(
+        rms_of(held_out.whole[mask]) > factor * rms_of(held_out.nothing[mask]) for mask in masks
+    )
+
+
+def _foretold(found: Findings) -> Mask:
+    """Return the samples of the blocks that the others can foretell, with what was found.
+
+    An effect that counts from rest needs how warm the machine began, which only the block that begins it shows.
+    """
+    evidence = found.search.evidence
+    foretold = np.ones(evidence.used.size, dtype=bool)
+    counts_from_rest = any(term.effect.counts_from_rest and term.effect.path == "DTF" for term in found.terms)
+    if counts_from_rest and evidence.start_k and not (evidence.holds_out_recordings or evidence.is_sparse):
+        foretold &= ~next(evidence.blocks(FOLDS))
+    return foretold
 
 
 def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
