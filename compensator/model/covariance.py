@@ -482,7 +482,7 @@ def may_be_covariance(p: Sequence[float]) -> bool:
     No variance is negative, and none of two states explains more of the other than all of it, but for rounding.
     """
     size = round((math.sqrt(8.0 * len(p) + 1.0) - 1.0) / 2.0)
-    if len(p) != size * (size + 1) // 2:
+    if not p or len(p) != size * (size + 1) // 2:
         return False
     full = np.zeros((size, size))
     full[np.triu_indices(size)] = p

@@ -62,8 +62,9 @@ LONGEST = 64 * 2**20
 #: Most bytes of a file that are read, those in chunks counted uncompressed, too: zeros take no space on a disk, but
 #: time to read. A recorder goes on in a new file at a quarter of that (`live_file.py`).
 LARGEST = 2**30
-#: Most zeros at the end of a file that a power cut may have left: more than is written at once.
-_MOST_ZEROS = 2**24
+#: Zeros at the end of a file that a power cut may have left: more than a record ends with; at most more than is written
+#: at once.
+_LEAST_ZEROS, _MOST_ZEROS = 64, 2**24
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
 #: Number of notes on bytes without content, and of flaws, that are kept.
@@ -197,7 +198,7 @@ class Container:
         self._used: set[int] = set()
         try:
             self._file: BinaryIO = open_file(path)
-            self._size = self._file.seek(0, 2)
+            self._size = self._written(self._file.seek(0, 2))
             self._file.seek(0)
         except OSError as error:
             raise DataError(f"{path}: {error.strerror or error}; expected a recording") from error
@@ -515,9 +516,21 @@ class Container:
         self._crc = zlib.crc32(self._buffer[: self._at], self._crc)
         self._base += self._at
         self._buffer, self._at = self._buffer[self._at :], 0
-        more = self._file.read(max(count - have, _WINDOW))
+        more = self._file.read(min(max(count - have, _WINDOW), self._size - self._base - have))
         self._count(len(more))
         self._buffer += more
+
+    def _written(self, size: int) -> int:
+        """Return where the file ends, without zeros in the place of what a power cut has lost.
+
+        They begin anywhere, also within a record, which is then as torn as one whose bytes are missing. More of them
+        than are written at once are judged where they are read.
+        """
+        self._file.seek(max(0, size - _WINDOW))
+        last = self._file.read(_WINDOW)
+        kept = last.rstrip(b"\0")
+        zeros = len(last) - len(kept)
+        return size - zeros if kept and zeros >= _LEAST_ZEROS else size
 
     def _count(self, size: int) -> None:
         """Count bytes that are read; beyond the limit the file is damaged, whatever it holds."""

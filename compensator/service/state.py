@@ -17,7 +17,7 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
-from compensator.messages import OFFSET_MAX, SEQ_MAX, UNREADABLE, TimeNs, check_numbers
+from compensator.messages import NUMBER_MAX, OFFSET_MAX, SEQ_MAX, UNREADABLE, TimeNs, check_numbers
 from compensator.model.covariance import may_be_covariance
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
@@ -213,9 +213,11 @@ def decode_state(data: bytes) -> CompensationState:
     if not all(-OFFSET_MAX <= value <= OFFSET_MAX for value in offsets):
         raise DataError(f"state: an offset is not finite, or above {OFFSET_MAX:g}")
     numbers = [value for one in nested for value in (*one.observer.x, *one.observer.p, *one.shifted_k)]
-    # Before the first zero there is no reference.
-    references = [(one.reference.t_q_degc, one.reference.at_degc) for one in nested]
-    numbers += [value for pair in references for value in pair if not all(map(math.isnan, pair))]
+    # Before the first zero there is no reference, and without Y none of it.
+    known = [(one.reference.t_q_degc, one.reference.at_degc) for one in nested] + [(state.zero.y_ref,)]
+    recorded = [value for values in known for value in values if not all(map(math.isnan, values))]
+    if not all(-NUMBER_MAX <= value <= NUMBER_MAX for value in recorded):
+        raise DataError("state: a reference is not finite, or larger than what a message can hold")
     numbers += [one.base for one in (state.axes or {}).values()]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
         raise DataError("state: a number of the engine is not finite, or too large to be valid")

@@ -19,7 +19,8 @@ from compensator.recording import container, live_file
 from compensator.recording.container import LARGEST, LONGEST, MAGIC
 from compensator.recording.framing import ATTACHMENT, CHANNEL, CHUNK, HEADER, MESSAGE
 from compensator.recording.live_file import FULL
-from compensator.recording.reading import first_sequence, last_value, recordings
+from compensator.recording.numbering import first_sequence
+from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 from tests.audit.made import MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import lines_of

@@ -75,11 +75,13 @@ def test_the_compact_file_says_what_the_live_one_said(tmp_path: Path) -> None:
     assert compact(path) == "" and list(read_messages(path)) == after
 
 
-def test_every_whole_record_of_a_torn_end_is_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize("zeros", [0, 4096], ids=["bytes missing", "zeros in their place"])
+def test_every_whole_record_of_a_torn_end_is_kept(tmp_path: Path, zeros: int) -> None:
+    """A power cut leaves the length of a file and zeros where its last pages were, also within a record."""
     path = live(tmp_path, 8)
     data = path.read_bytes()
     for cut in range(data.index(b'"seq":7,') - 60, len(data), 37):
-        path.write_bytes(data[:cut])
+        path.write_bytes(data[:cut] + bytes(zeros))
         before, end = [m for m in read_messages(path) if m.topic != "chain"], end_of_chain(path)
         compact(path)
         after = [m for m in read_messages(path) if m.topic != "chain"]

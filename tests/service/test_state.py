@@ -117,7 +117,7 @@ def test_a_settled_covariance_stays_settled() -> None:
     assert [bits(restored.process(r)) for r in raws[1800:]] == [bits(whole.process(r)) for r in raws[1800:]]
 
 
-@given(st.tuples(*[NUMBERS, st.floats(0.0, 1e60)] * 2), NUMBERS, NUMBERS)
+@given(st.tuples(*[NUMBERS, st.floats(0.0, 1e60)] * 2), st.floats(-1e30, 1e30) | st.just(math.nan), NUMBERS)
 @settings(max_examples=200, deadline=None)
 def test_every_number_comes_back_to_the_bit(
     guard: tuple[float, float, float, float], y_ref: float, missing: float
@@ -177,6 +177,9 @@ def changed(state: dict[str, Any], value: Any, *keys: Any) -> dict[str, Any]:
         (changed(at_work(), "nan", "zero", "y_base"), "y_base"),
         (changed(at_work(), -5.0, "guards", "t_q_degc", 1), "guards"),
         (changed(at_work(), "nan", "engine", "reference", "at_degc"), "not finite"),
+        (changed(at_work(), 1e31, "zero", "y_ref"), "reference"),
+        (changed(at_work(), 1e31, "zero", "y_base"), "y_base"),
+        (changed(at_work(), [], "engine", "observer", "p"), "covariance"),
         (changed(at_work(), -5.0, "engine", "observer", "p", 0), "covariance"),
         (changed(at_work(), 1e9, "engine", "observer", "p", 1), "covariance"),
         (changed(at_work(), "inf", "offset_um"), "not finite"),

@@ -10,11 +10,12 @@ from typing import Annotated
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.messages import NUMBER_MAX
 from compensator.model.engine import EngineState, Estimate
 
 #: A number of samples, and a value that is known: a state from a file is refused with any other.
 Count = Annotated[int, msgspec.Meta(ge=0)]
-Known = Annotated[float, msgspec.Meta(ge=-1e60, le=1e60)]
+Known = Annotated[float, msgspec.Meta(ge=-NUMBER_MAX, le=NUMBER_MAX)]
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
