@@ -9,7 +9,7 @@ from typing import Any
 from asyncua import Client, ua
 
 from compensator.bridge.axes_settings import OpcUaAxes
-from compensator.bridge.plc_client import INTEGERS, REALS, PlcClient, TypedNode, data_value, log, typed
+from compensator.bridge.plc_client import INTEGERS, REALS, PlcClient, TypedNode, data_value, log, real, typed
 from compensator.bridge.register import AxesRegisters, Register
 from compensator.bridge.settings import OpcUa
 from compensator.receiver import AxesReceiver, ControlState, Receiver
@@ -59,10 +59,10 @@ class Bridge(PlcClient):
     async def _cycle(self) -> None:
         nodes = self._nodes
         node, kind = nodes["offset_node"]
-        found = float(await node.read_value())
+        found = real(await node.read_value())
         self._receiver.record(found * self._settings.sign * self._settings.unit_um)
         may_move = self.register.check(monotonic_s(), found)
-        enabled = "enable_node" not in nodes or bool(await nodes["enable_node"][0].read_value())
+        enabled = "enable_node" not in nodes or await nodes["enable_node"][0].read_value() is True
         self._hold_unless(may_move and enabled)
         applied = self._receiver.poll()
         if may_move:
@@ -129,7 +129,7 @@ class AxesBridge(PlcClient):
         self._hold_unless(may_move and read.get("enable_node", True) is True)
         length = read.get("tool_length_node")
         control = ControlState(
-            tool_length_mm=None if length is None else float(length),
+            tool_length_mm=None if length is None else real(length),
             positions_mm=self._at_mm,
             cutting=read.get("cutting_node", True) is not False,
         )
@@ -154,7 +154,7 @@ class AxesBridge(PlcClient):
             result.StatusCode.check()
         values = [None if one.StatusCode.is_bad() or one.Value is None else one.Value.Value for one in results]
         count = len(self._values)
-        found = tuple(math.nan if value is None else float(value) for value in values[:count])
+        found = tuple(math.nan if value is None else real(value) for value in values[:count])
         return found, dict(zip(keys, values[count:], strict=True))
 
     async def _write(self, values: list[tuple[TypedNode, float]]) -> None:

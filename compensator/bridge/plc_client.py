@@ -175,6 +175,19 @@ async def typed(client: Client, key: str, name: str, kinds: tuple[ua.VariantType
     return node, kind
 
 
+def real(value: object) -> float:
+    """Return the number that a node holds.
+
+    Raises
+    ------
+    asyncua.ua.UaError
+        If it holds nothing, an array or a text: the PLC is not ready, or the node is not the one that was meant.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ua.UaError(f"a node that must hold a number holds a value of type {type(value).__name__}")
+    return float(value)
+
+
 def data_value(value: float, kind: ua.VariantType) -> ua.DataValue:
     """Return a value without time and status, which PLCs refuse."""
     return ua.DataValue(ua.Variant(value, kind))

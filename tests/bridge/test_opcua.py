@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from asyncua import ua
 
 from compensator.bridge.opcua import Bridge
+from compensator.bridge.plc_client import _GONE, real
 from compensator.bridge.settings import load_bridge
 from compensator.cli import main
 from compensator.errors import ConfigError
@@ -243,3 +245,29 @@ def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_the_trial_without_a_plc_can_be_loaded() -> None:
     settings, opcua = load_bridge(Path(__file__).parents[2] / "deploy/opcua/trial.toml")
     assert (settings.prefix, opcua.offset_node, opcua.unit) == ("shop/vmc-07", "ns=2;i=2", "um")
+
+
+@pytest.mark.parametrize("value", [None, [1.0], "1.0", True, object()])
+def test_a_node_that_holds_no_number_is_trouble_and_no_end(value: object) -> None:
+    """The bridge takes it for a PLC that is not ready, says so in one line, and tries again."""
+    with pytest.raises(_GONE, match="must hold a number"):
+        real(value)
+
+
+async def test_a_plc_that_is_not_ready_is_asked_again(tmp_path: Path) -> None:
+    said: list[str] = []
+    async with Plc(free_port(), 0.0) as plc:
+        await plc.offset.write_value(ua.DataValue(ua.Variant([1.0, 2.0], ua.VariantType.Float)))
+        async with bridging(written(tmp_path, plc.endpoint, free_port()), said) as bridge:
+
+            async def in_trouble() -> bool:
+                return "must hold a number" in bridge.register.trouble
+
+            await until(in_trouble, "the array is not noticed")
+            await plc.put(0.0)
+
+            async def is_ready() -> bool:
+                return not bridge.register.trouble
+
+            await until(is_ready, lambda: bridge.register.trouble)
+    assert any("must hold a number" in line for line in said)
