@@ -22,7 +22,7 @@ from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
 from compensator.commands.outputs import check_outputs
-from compensator.commands.stopping import stoppable
+from compensator.commands.stopping import stoppable, was_interrupted
 from compensator.commands.wrapping import styled, wrapped
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
@@ -168,6 +168,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(f"{json.dumps(result)}\n")
         return getattr(error, "exit_code", 1)
     except KeyboardInterrupt:
+        return 130
+    if was_interrupted():
         return 130
     if answer is None:
         return 0

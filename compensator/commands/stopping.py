@@ -8,8 +8,10 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_interrupted = False
 
 
 def stoppable() -> None:
@@ -17,12 +19,26 @@ def stoppable() -> None:
 
     A script starts its background jobs with SIGINT ignored, and whoever starts a program may ignore or block both.
     """
+    global _interrupted  # noqa: PLW0603  a signal belongs to the process
     if threading.current_thread() is not threading.main_thread():
         return
-    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
-        if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(number, usual)
+    _interrupted = False
+    if signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, signal.default_int_handler):
+        signal.signal(signal.SIGINT, _interrupt)
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)  # last: one that waits would be lost were it still ignored
+
+
+def was_interrupted() -> bool:
+    """Return whether SIGINT has come, also where Python has dropped its exception, as in the callback of a weak one."""
+    return _interrupted
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    global _interrupted  # noqa: PLW0603
+    _interrupted = True
+    signal.default_int_handler(number, frame)
 
 
 def on_stop(stop: Callable[[], object]) -> None:

@@ -267,7 +267,9 @@ def recordings_in(given: Iterable[Path]) -> list[Path]:
 
 
 def _found(folder: Path, pattern: str) -> list[Path]:
-    return sorted(folder.glob(pattern), key=lambda path: order_of(path.stem))
+    # A hidden file is what a copy over a network has left beside another one.
+    found = [path for path in folder.glob(pattern) if not path.name.startswith(".")]
+    return sorted(found, key=lambda path: order_of(path.stem))
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:

@@ -27,7 +27,7 @@ from compensator.recording.framing import (
     SCHEMA,
     SUMMARY_OFFSET,
 )
-from compensator.recording.reading import recordings
+from compensator.recording.reading import recordings, recordings_in
 from tests.audit.made import MACHINE, Service
 
 SEEDS = range(40)
@@ -319,3 +319,11 @@ def test_a_schema_or_a_channel_after_the_first_message_is_found(tmp_path: Path, 
 
 def _codes(found: Audit) -> list[str]:
     return [str(remark.code) for remark in found.remarks]
+
+
+def test_what_a_copy_over_a_network_leaves_beside_a_recording_is_no_recording(tmp_path: Path) -> None:
+    Service(tmp_path).run(3).stop()
+    (path,) = recordings_in([tmp_path])
+    (tmp_path / f"._{path.name}").write_bytes(b"\x00\x05\x16\x07 resource fork")
+    assert recordings_in([tmp_path]) == [path]
+    assert audit(recordings_in([tmp_path])).clean

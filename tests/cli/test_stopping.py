@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from compensator.cli import main as cli_main
+from compensator.commands import Answer
 from tests.receiver.wire import free_port, router, until
 
 ROOT = Path(__file__).parents[2]
@@ -149,3 +151,23 @@ with until_stopped() as stop:
 
 def test_a_signal_that_comes_while_a_program_waits_for_it_does_not_lock_it_up() -> None:
     subprocess.run([sys.executable, "-c", STORMED], timeout=60, check=True)
+
+
+def test_an_interrupt_that_python_drops_is_not_taken_for_success(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An exception of a signal's handler that meets the callback of a weak reference is printed and lost."""
+
+    class Dropped:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def command(_: object) -> Answer:
+        held = Dropped()
+        del held
+        return Answer({}, "done")
+
+    monkeypatch.setattr("compensator.cli.load", lambda name: command)
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+    assert cli_main(["check", "--config", "machine.toml"]) == 130
+    assert "done" not in capsys.readouterr().out

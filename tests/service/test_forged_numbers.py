@@ -66,6 +66,7 @@ async def test_the_service_starts_and_says_which_record_it_cannot_use(
         # What came before the record counts: the offset goes on from the last but one that was published.
         assert "is used up to a record that cannot be" in told[0]
         assert largest_step(machine.outcomes[19:21]) <= 2 * 8.0
+        assert not any("cannot be restored" in event.text for event in machine.events("restart"))
     numbers = [outcome.sample.seq for outcome in machine.outcomes[20:]]
     assert numbers == [before + 1, before + 2, before + 3]
     # And at the start after it, over the file that was made now.

@@ -6,7 +6,8 @@ It is used at a restart with another configuration or model, and when a model is
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, command_of
 from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording.reading import decode, read_messages, recordings
+from compensator.recording.reading import RawRecord, decode, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
 from compensator.service.state import decode_state
@@ -27,6 +28,8 @@ from compensator.service.status import Zero
 
 #: Longest warm-up, in slowest time constants: 0.03 % of the influence of earlier samples remains.
 WARM_UP = 8.0
+#: So many of the newest estimates are looked at for one that can be read.
+_NEWEST = 100
 
 
 @dataclass(slots=True, kw_only=True)
@@ -115,7 +118,7 @@ def warm_up(
     else:
         compensation.begin(zero)
     for path in window.files:
-        for step in steps_of(path):
+        for step in usable_steps(path):
             sample = step.sample
             if sample is None or (sample.seq > run.seq and sample.time_utc_ns >= window.from_ns):
                 outcome = run.process(step)
@@ -254,7 +257,7 @@ def window_of(
         if opening is not None and opening.equals(zero):
             continue  # the zero was set before this file
         zeros = []
-        for step in steps_of(path):
+        for step in usable_steps(path):
             if step.zero is not None:
                 zeros.append(step)
             between_samples()
@@ -275,10 +278,19 @@ def window_of(
     return window
 
 
+def usable_steps(path: Path) -> Iterator[RecordedStep]:
+    """Yield the groups of a recording, up to a record that no service wrote: what came before it was published.
+
+    What has the name of a recording and is none has no group: it must not keep a model from its state.
+    """
+    with suppress(DataError):
+        yield from steps_of(path)
+
+
 def _first_needed(files: list[Path], from_ns: int) -> int:
     """Return the index of the last file that starts before a time."""
     for i in range(len(files) - 1, 0, -1):
-        first = next((step.sample for step in steps_of(files[i]) if step.sample is not None), None)
+        first = next((step.sample for step in usable_steps(files[i]) if step.sample is not None), None)
         if first is not None and first.time_utc_ns <= from_ns:
             return i
     return 0
@@ -286,10 +298,13 @@ def _first_needed(files: list[Path], from_ns: int) -> int:
 
 def _last_estimate(files: list[Path]) -> EstimateMessage | None:
     for path in reversed(files):
-        newest = deque(read_messages(path, ("estimate",)), maxlen=1)
-        if newest:
-            message = decode(newest[0], path)
-            return message if isinstance(message, EstimateMessage) else None
+        newest: deque[RawRecord] = deque(maxlen=_NEWEST)
+        with suppress(DataError):
+            newest.extend(read_messages(path, ("estimate",)))
+        for record in reversed(newest):
+            with suppress(DataError):
+                message = decode(record, path)
+                return message if isinstance(message, EstimateMessage) else None
     return None
 
 

@@ -23,9 +23,9 @@ from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
-from compensator.service.replay import RecordedStep, steps_of
+from compensator.service.replay import RecordedStep
 from compensator.service.status import Zero
-from compensator.service.transfer.candidate import RecordedRun, Window, window_of
+from compensator.service.transfer.candidate import RecordedRun, Window, usable_steps, window_of
 from compensator.service.transfer.comparison import BLOCK_MIN, FEWEST, Comparison, changed, not_judged
 
 #: How much of the record is compared, h.
@@ -180,7 +180,7 @@ def _run(
 
 def _steps(window: Window, between_samples: Callable[[], None]) -> Iterator[RecordedStep]:
     for path in window.files:
-        for step in steps_of(path):
+        for step in usable_steps(path):
             yield step
             between_samples()
 
