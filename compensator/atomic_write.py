@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +16,15 @@ from compensator.input_file import resolved
 
 
 @contextmanager
-def atomic_write(path: Path) -> Iterator[TextIO]:
+def atomic_write(path: Path, *, may_stream: bool = False) -> Iterator[TextIO]:
     r"""Open a text file that replaces the target when it is complete; after an error it is removed.
 
     Parameters
     ----------
     path : pathlib.Path
         The file; its folder must exist. An existing file remains until it is replaced. A link remains a link.
+    may_stream : bool
+        Whether what `is_stream` is written to as it is.
 
     Yields
     ------
@@ -33,7 +36,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     UsageError
         If the folder does not exist.
     OSError
-        If the target is a device, a pipe or a folder; it is kept.
+        If the target is another device, pipe or folder; it is kept.
 
     Examples
     --------
@@ -44,6 +47,10 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     ...     os.listdir(folder)
     ['a.csv']
     """
+    if may_stream and is_stream(path):
+        with path.open("w", newline="", encoding="utf-8") as file:
+            yield file
+        return
     path = resolved(path)
     require_folder(path)
     _require_regular(path)
@@ -56,6 +63,20 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
         os.fsync(descriptor)
         # With a restrictive umask of root, the service could not read its own model.
         os.fchmod(descriptor, 0o644)
+
+
+def is_stream(path: Path) -> bool:
+    """Return whether a path is a character device such as `/dev/null`, or a pipe that somebody reads.
+
+    `/dev/stdout` is one or the other; writing to a pipe without a reader would wait for one.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISFIFO(mode):
+            os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
 
 
 def require_folder(path: Path) -> None:

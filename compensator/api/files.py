@@ -104,7 +104,7 @@ def write_curves(path: str | os.PathLike[str], columns: dict[str, Vector]) -> Pa
     OSError
         If the file cannot be written.
     """
-    with atomic_write(Path(path)) as file:
+    with atomic_write(Path(path), may_stream=True) as file:
         csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
     return Path(path)
 

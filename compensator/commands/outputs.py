@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from compensator.atomic_write import is_stream
 from compensator.errors import UsageError
 from compensator.input_file import resolved
 
@@ -21,6 +22,8 @@ from compensator.input_file import resolved
 _ENDINGS = {".csv", ".html", ".json", ".mcap", ".pdf", ".png", ".toml", ".xlsx"}
 #: Ending of pages; a page that is asked for may have another.
 _PAGE = ".html"
+#: Ending of tables, the only results that may go to a pipe or a device as `/dev/stdout` and `/dev/null` are.
+_TABLE = ".csv"
 #: In place of an ending: of what the command reads.
 _INPUT = "input"
 
@@ -160,8 +163,7 @@ def _check_file(path: Path, option: str, ending: str, *, is_asked: bool = False)
     """Refuse a file that cannot be written, or that is probably not meant; the folder of a page is to be there."""
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
-    if path.exists() and not path.is_file():
-        # Writing to a pipe waits for its reader, and a device keeps nothing.
+    if path.exists() and not path.is_file() and not (ending == _TABLE and is_stream(path)):
         raise UsageError(f"{option} {path}: is not a regular file, expected the name of a file")
     if ending == _PAGE:
         from compensator.report.formats import check_replaced, checked
@@ -170,6 +172,8 @@ def _check_file(path: Path, option: str, ending: str, *, is_asked: bool = False)
         check(path, option=option)
     elif path.suffix.lower() in _ENDINGS - {ending}:
         raise UsageError(f"{option} {path}: expected a name that ends in {ending}")
+    if path.exists() and not path.is_file():
+        return
     _check_parent(path, option)
     if path.exists() and not os.access(path, os.W_OK):
         raise UsageError(f"{option} {path}: no permission to write it")

@@ -66,7 +66,7 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         curves = Curves()
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-    with progress_bar("comparing") as progress, atomic_write(out) if out else nullcontext() as file:
+    with progress_bar("comparing") as progress, atomic_write(out, may_stream=True) if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow

@@ -93,7 +93,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
-    with atomic_write(Path(out)) as file:
+    with atomic_write(Path(out), may_stream=True) as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())
