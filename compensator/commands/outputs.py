@@ -163,7 +163,8 @@ def _check_file(path: Path, option: str, ending: str, *, is_asked: bool = False)
     """Refuse a file that cannot be written, or that is probably not meant; the folder of a page is to be there."""
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
-    if path.exists() and not path.is_file() and not (ending == _TABLE and is_stream(path)):
+    streams = ending == _TABLE and is_stream(path)
+    if path.exists() and not (path.is_file() or streams):
         raise UsageError(f"{option} {path}: is not a regular file, expected the name of a file")
     if ending == _PAGE:
         from compensator.report.formats import check_replaced, checked
@@ -172,7 +173,7 @@ def _check_file(path: Path, option: str, ending: str, *, is_asked: bool = False)
         check(path, option=option)
     elif path.suffix.lower() in _ENDINGS - {ending}:
         raise UsageError(f"{option} {path}: expected a name that ends in {ending}")
-    if path.exists() and not path.is_file():
+    if streams:
         return
     _check_parent(path, option)
     if path.exists() and not os.access(path, os.W_OK):

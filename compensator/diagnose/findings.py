@@ -146,8 +146,8 @@ def findings_of(
     found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight)
     if evidence.is_sparse or all(term.effect.observed for term in found.terms):
         return found
-    is_no_worse = _is_no_worse(found)
-    if is_no_worse and not _is_surpassed(found):
+    base_um, own_um = in_free_run(found)
+    if own_um <= base_um and not _is_surpassed(found):
         return found
     shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
     rms = found.search.criterion.rms
@@ -155,7 +155,7 @@ def findings_of(
     if left < hidden:
         return shown
     # The effects make up for the source. Channels that explain most of it alone take their place.
-    is_better = not is_no_worse and in_free_run(shown)[1] < in_free_run(found)[1]
+    is_better = own_um > base_um and in_free_run(shown)[1] < own_um
     return shown if is_better and nothing - left > MOSTLY * (nothing - hidden) else found
 
 

@@ -526,11 +526,13 @@ class Container:
         They begin anywhere, also within a record, which is then as torn as one whose bytes are missing. More of them
         than are written at once are judged where they are read.
         """
+        self._file.seek(max(0, size - _LEAST_ZEROS))
+        if size < _LEAST_ZEROS or self._file.read(_LEAST_ZEROS).strip(b"\0"):
+            return size
         self._file.seek(max(0, size - _WINDOW))
         last = self._file.read(_WINDOW)
         kept = last.rstrip(b"\0")
-        zeros = len(last) - len(kept)
-        return size - zeros if kept and zeros >= _LEAST_ZEROS else size
+        return size - len(last) + len(kept) if kept else size
 
     def _count(self, size: int) -> None:
         """Count bytes that are read; beyond the limit the file is damaged, whatever it holds."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from compensator.errors import DataError
 from compensator.messages import SEQ_MAX
 from compensator.recording.head import HeadKeeper
-from compensator.recording.reading import RawRecord, decode, linked, read_messages, recordings, run_of
+from compensator.recording.reading import decode, linked, messages, recordings, run_of
 
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
 _NUMBERED = ("sample", "offset")
@@ -101,8 +101,8 @@ def _by_name(folder: Path, machine: str) -> Iterator[_Numbers]:
     for path in reversed(recordings(folder, machine)):
         found: set[int] = set()
         with suppress(DataError):
-            for record in read_messages(path, _NUMBERED):
-                found.add(_number(record, path))
+            for message in messages(path, _NUMBERED):
+                found.add(message.seq)
         yield _Numbers(path.name, found)
 
 
@@ -123,14 +123,9 @@ def _as_written(path: Path, values: frozenset[bytes]) -> set[int] | None:
     with suppress(DataError):
         for record, value in linked(path):
             if record.topic in _NUMBERED:
-                found.add(_number(record, path))
+                found.add(decode(record, path).seq)
             if value in values:
                 known = set() if known is None else known
                 known |= found
                 found.clear()
     return known
-
-
-def _number(record: RawRecord, path: Path) -> int:
-    number: int = decode(record, path).seq
-    return number

@@ -17,12 +17,11 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.errors import DataError
-from compensator.messages import NUMBER_MAX, OFFSET_MAX, SEQ_MAX, UNREADABLE, TimeNs, check_numbers
+from compensator.messages import NUMBER_MAX, OFFSET_MAX, SEQ_MAX, UNREADABLE, Number, TimeNs, check_numbers
 from compensator.model.covariance import may_be_covariance
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.axes import OutputState
 from compensator.service.plausibility import JumpState, PlausibilityState
-from compensator.service.plausibility.jump_state import Known
 from compensator.service.probing import ProbingState
 
 #: Version of the state; a state of another version is refused.
@@ -52,7 +51,7 @@ class ZeroState:
     """
 
     y_ref: float = NAN
-    y_base: Known = 0.0
+    y_base: Number = 0.0
     wanted: bool = False
     mode: ZeroMode = "auto"
 

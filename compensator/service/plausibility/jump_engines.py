@@ -370,19 +370,16 @@ def _move(
 
 def _enter_jump(state: JumpState, name: str, difference: float, std: float, *, goes_on: bool) -> None:
     """Enter a jump, or the next step of one, in the state."""
-    before = state.jumps.get(name)
-    is_again = state.is_suspect and before is not None
-    state.steps += is_again and goes_on
-    if is_again and not goes_on:
+    before = state.jumps.get(name) if state.is_suspect else None
+    state.steps += before is not None and goes_on
+    if before is not None and not goes_on:
         state.again[name] = state.again.get(name, 0) + 1
     if state.phase == Phase.AIR_RETURNED:
         state.phase = Phase.AIR
     # What goes on to move, from sample to sample or while it is only watched, is one jump; a suspect channel that had
     # come to rest has jumped again.
-    is_further = before is not None and state.is_suspect and not goes_on
-    first_k = before.first_k if before is not None and is_further else difference
-    left_k = before.left_k if before is not None else 0.0
-    state.jumps[name] = ChannelJump(size_k=difference, std_k=std, first_k=first_k, left_k=left_k)
+    first_k = before.first_k if before is not None and not goes_on else difference
+    state.jumps[name] = ChannelJump(size_k=difference, std_k=std, first_k=first_k)
 
 
 def is_unsteady(state: JumpState) -> bool:

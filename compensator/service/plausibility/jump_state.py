@@ -5,17 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from enum import StrEnum
-from typing import Annotated
 
 import msgspec
 
 from compensator.arrays import NAN
-from compensator.messages import NUMBER_MAX
+from compensator.messages import Count, Number
 from compensator.model.engine import EngineState, Estimate
-
-#: A number of samples, and a value that is known: a state from a file is refused with any other.
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Known = Annotated[float, msgspec.Meta(ge=-NUMBER_MAX, le=NUMBER_MAX)]
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
@@ -65,11 +60,11 @@ class ChannelJump(msgspec.Struct, kw_only=True):
         If it is back: what is left of its jump, K; 0 where that is too little to be one.
     """
 
-    size_k: Known
-    std_k: Known
-    first_k: Known
+    size_k: Number
+    std_k: Number
+    first_k: Number
     back: Count = 0
-    left_k: Known = 0.0
+    left_k: Number = 0.0
 
 
 class JumpState(msgspec.Struct, kw_only=True):
@@ -125,10 +120,10 @@ class JumpState(msgspec.Struct, kw_only=True):
     phase: Phase = Phase.NONE
     age: Count = 0
     loose: Count = 0
-    last: dict[str, Known] = {}
+    last: dict[str, Number] = {}
     unseen: dict[str, Count] = {}
     samples: Count = 0
-    ratio: Known = 0.0
+    ratio: Number = 0.0
     moving: Count = 0
     at_held: Count = 0
     y_for: Count = 0
@@ -137,7 +132,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     probes_against: Count = 0
     believing: Branch | None = None
     shifted: Branch | None = None
-    learned_um: Known = 0.0
+    learned_um: Number = 0.0
     zero_in_use: Estimate | None = None
     beside: JumpState | None = None
 
