@@ -215,12 +215,19 @@ def test_no_diagnosis_while_sensors_contradict_each_other_or_a_temperature_is_mi
     assert NIGHT + 90 + 29 <= decisions(steps)[0][0] <= NIGHT + 90 + 31 and len(night.asked) == 1
 
 
-def test_a_run_continues_from_its_state_with_the_same_bits() -> None:
+@pytest.mark.parametrize("lost", [(), ("y_um",), ("t_q_degc",)], ids=["whole", "without Y", "without T_Q"])
+def test_a_run_continues_from_its_state_with_the_same_bits(lost: tuple[str, ...]) -> None:
+    """Also where a channel was missing for ten minutes before it: its state then has values that are missing."""
+
     def whole() -> LoopRun:
         return LoopRun(settings(), QUILL, Night(shown(extended())))
 
+    def losing(i: int, values: dict[str, float]) -> None:
+        if NIGHT + 285 <= i < NIGHT + 295:
+            values.update(dict.fromkeys(lost, math.nan))
+
     one, other = whole(), whole()
-    source, again = machine(NIGHT + 900), machine(NIGHT + 900)
+    source, again = machine(NIGHT + 900, change=losing), machine(NIGHT + 900, change=losing)
     run(one, source, NIGHT + 300)
     run(other, again, NIGHT + 300)
     resumed = whole()

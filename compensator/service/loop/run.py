@@ -15,7 +15,7 @@ from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
-from compensator.messages import Candidate, Sample
+from compensator.messages import UNREADABLE, Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
 from compensator.service.loop.level import ErrorBlocks
@@ -170,7 +170,7 @@ class LoopRun:
             at_rest=self._at_rest,
             warm_utc_ns=self._warm_ns,
         )
-        return msgspec.msgpack.encode(saved)
+        return msgspec.json.encode(saved)  # as in a recording, a value that is missing is null
 
     def restore(self, state: bytes) -> None:
         """Start again from a state; `pause` then accounts for the time since.
@@ -181,8 +181,8 @@ class LoopRun:
             If it cannot be used; nothing is changed then.
         """
         try:
-            saved = msgspec.msgpack.decode(state, type=_Saved)
-        except msgspec.MsgspecError as error:
+            saved = msgspec.json.decode(state, type=_Saved)
+        except UNREADABLE as error:
             raise DataError(f"state of a run: {error}") from error
         compensation = Compensation(self._config, model_of(self._config, saved.model, source="state of a run"))
         compensation.restore(saved.compensation)
