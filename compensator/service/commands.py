@@ -32,6 +32,10 @@ WAITING_PROBES = 20
 REFUSED_PROBES = 20
 #: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
+#: Commands whose arguments are a `ModelRequest`.
+_ABOUT_MODELS = (CommandName.ADOPT, CommandName.BACK, CommandName.DISMISS)
+#: Longest part of a mode that a refusal repeats, characters.
+_SHOWN = 40
 
 
 class Commands:
@@ -105,7 +109,7 @@ class Commands:
             arguments = self._checked(name, payload)
             if loop is None or self._is_full(name):
                 raise ServiceError("the service cannot accept a command now")
-            if name in (CommandName.ADOPT, CommandName.BACK, CommandName.DISMISS):
+            if name in _ABOUT_MODELS:
                 request = ModelRequest.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
                 if name == CommandName.DISMISS or request.candidate:
@@ -241,18 +245,23 @@ class Commands:
             )
 
     def _checked(self, name: str, payload: bytes) -> dict[str, Any]:
-        """Return the arguments of an acceptable command."""
+        """Return the arguments of an acceptable command, as far as they act."""
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
         except UNREADABLE as error:
             raise ServiceError(f"{name}: the payload is not a JSON object") from error
         mode = arguments.get("mode", "auto")
         if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):
+            shown = repr(mode[:_SHOWN]) if isinstance(mode, str) else type(mode).__name__
             raise ServiceError(
-                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back, "
+                f"{name} {shown}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back, "
                 "dismiss"
             )
-        return arguments
+        if name in _ABOUT_MODELS:
+            return arguments
+        # What does not act is not recorded either: it may hold numbers and depths that no reader of a recording takes,
+        # and a start uses a recording up to such a record only.
+        return {"mode": mode} if name == CommandName.ZERO and "mode" in arguments else {}
 
     def _is_full(self, name: str) -> bool:
         return self._waiting.qsize() >= WAITING_COMMANDS + (name == CommandName.HOLD)

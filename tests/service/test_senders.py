@@ -73,6 +73,33 @@ async def test_a_hold_is_taken_however_many_commands_wait(tmp_path: Path) -> Non
     assert "operator_hold" in bench.outcomes[-1].offset.reasons
 
 
+@pytest.mark.parametrize(
+    "more",
+    [b"9223372036854775808", b"1" + 400 * b"0", b"-1e300", 500 * b"[" + 500 * b"]"],
+    ids=["2^63", "10^400", "-1e300", "nested"],
+)
+async def test_what_a_payload_says_besides_does_not_prevent_an_audit(tmp_path: Path, more: bytes) -> None:
+    bench = replayable(tmp_path)
+    payload = b'{"mode": "warm", "more": ' + more + b"}"
+    bench.at_sample[10] = lambda: bench.daemon.command("zero", payload, ANNA)
+    bench.at_sample[20] = lambda: bench.daemon.command("hold", payload, ANNA)
+    await bench.run(30)
+    assert "operator_hold" in bench.outcomes[-1].offset.reasons
+    assert look(tmp_path / "rec").clean
+    kept = [set(event["data"]) for event in events(tmp_path / "rec", "command")]
+    assert kept == [{"mode", "command", "by", "by_proof"}, {"command", "by", "by_proof"}]
+    assert events(tmp_path / "rec", "error") == []
+
+
+async def test_a_mode_that_is_no_text_is_refused_in_words(tmp_path: Path) -> None:
+    bench = replayable(tmp_path)
+    replies: list[Any] = []
+    payload = b'{"mode": ' + 500 * b"[" + 500 * b"]" + b"}"
+    bench.at_sample[2] = lambda: replies.append(bench.daemon.command("zero", payload, ANNA))
+    await bench.run(4)
+    assert replies[0]["ok"] is False and replies[0]["text"].startswith("zero list: expected zero with mode auto")
+
+
 async def test_the_recording_says_who_commanded_whatever_the_payload_says(tmp_path: Path) -> None:
     bench = replayable(tmp_path)
     liar = b'{"mode": "warm", "by": "the boss", "by_proof": "certificate"}'
