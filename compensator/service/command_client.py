@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import datetime
 import getpass
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import zenoh
 
 from compensator.certificates import check_files, common_name_of
 from compensator.config import Zenoh
 from compensator.errors import ConfigError, ServiceError, UsageError
 from compensator.events import CommandName
-from compensator.messages import ProbeRequest, encode
+from compensator.messages import UNREADABLE, ProbeRequest, encode
 from compensator.service.publisher import SENDER
 from compensator.service.session import (
     ALIVE,
@@ -28,6 +28,9 @@ from compensator.service.session import (
     set_key,
     try_once,
 )
+
+#: Longest reply to a command that is read, bytes.
+LONGEST_REPLY = 1_000_000
 
 
 class NotReached(ServiceError):
@@ -131,7 +134,7 @@ def ask(
     NotReached
         If nothing answers at the endpoints, or no service of that prefix is alive; the message names those that are.
     ServiceError
-        If the service is alive but does not answer.
+        If the service is alive but does not answer, or what answers is no service.
     """
     operator = operator or operator_here(settings)
     unreached = f"{settings.prefix}: the service cannot be reached"
@@ -143,8 +146,7 @@ def ask(
         with zenoh.open(operator.config) as session:
             for answer in session.get(key, payload=payload, timeout=timeout_s):
                 if answer.ok is not None:
-                    reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
-                    return reply
+                    return _reply(key, answer.ok.payload)
             # An operator who may see only this machine must query only this machine.
             own = alive_services(session, timeout_s, f"{settings.prefix}/{ALIVE}")
             alive = {*own, *alive_services(session, timeout_s)}
@@ -158,6 +160,20 @@ def ask(
             f"{operator.name or 'this command'}"
         )
     raise NotReached(f"{unreached}: no service with that prefix at {where}; {services_text(alive)}")
+
+
+def _reply(key: str, payload: zenoh.ZBytes) -> dict[str, Any]:
+    """Read the reply to a command, which anybody may have sent where no access list is enabled."""
+    try:
+        reply = msgspec.json.decode(payload.to_bytes() if len(payload) <= LONGEST_REPLY else b"", type=dict[str, Any])
+    except UNREADABLE:
+        reply = {}
+    if not isinstance(reply.get("ok"), bool) or not isinstance(reply.get("text"), str):
+        raise ServiceError(
+            f"{key}: the answer is not that of a service, so it is unknown whether the command acts; find out which "
+            f"program answers below this prefix"
+        )
+    return reply
 
 
 def send_probe(

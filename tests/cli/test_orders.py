@@ -6,11 +6,15 @@ import json
 import os
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from compensator.cli import main
+from compensator.commands.probes import CommandSink
 from compensator.config import Zenoh
+from compensator.probes.probe import NotSent, Probe
+from compensator.probes.settings import Service
 from compensator.service.presence import is_used, sole_user
 from compensator.service.publisher import Publisher
 from tests.receiver.wire import free_port
@@ -45,6 +49,21 @@ def test_a_wrong_prefix_is_told_from_a_service_that_is_away(tmp_path: Path, caps
         assert main(["watch", "--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop/vmc-70", "--once"]) == 1
         error = capsys.readouterr().err
         assert "no messages below shop/vmc-70" in error and "services there: shop/vmc-07\n" in error
+
+
+@pytest.mark.parametrize("reply", [[], None, "held", {}, {"ok": "no", "text": "not held"}, {"ok": True, "text": 1}])
+def test_an_answer_that_is_not_that_of_a_service_is_no_success(
+    reply: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", listen=[f"tcp/127.0.0.1:{port}"])
+    with Publisher(settings, lambda *_: reply):
+        assert main(["hold", "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port)]) == 1
+        error = capsys.readouterr().err
+        assert "the answer is not that of a service" in error and "Traceback" not in error
+        service = Service(prefix="shop/vmc-07", send_within_s=60.0, connect=(f"tcp/127.0.0.1:{port}",))
+        with pytest.raises(NotSent, match="not that of a service"):
+            CommandSink(service, "probes.toml").send(Probe(time_utc_ns=1, measured_um=1.0, offset_applied_um=0.0))
 
 
 def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> None:
