@@ -17,7 +17,7 @@ from drivers.families.base import MODBUS, Family, ModbusDevice, ModbusSettings
 from drivers.families.inputs import check_input, input_tables
 from drivers.lines.modbus_line import ModbusLine
 from drivers.protocols.modbus import MOST_REGISTERS, Request
-from drivers.protocols.registers import NumberType, WordOrder, decode, words_of
+from drivers.protocols.registers import NumberType, WordOrder, as_decoded, decode, words_of
 from drivers.reading import Quality, Reading
 from drivers.settings import Name, Where, one_of, settings
 
@@ -59,7 +59,7 @@ class MapInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         See the equation of this module.
     bad_values : dict
         Quality by number (`{"32767" = "open_circuit"}`), or numbers by quality (`{open_circuit = [32767]}`).
-        Numbers are those in the registers, before scaling.
+        Numbers are those in the registers, before scaling; whole ones also by their bits (`0x8000` of an `int16`).
     minimum, maximum : float, optional
         Limits of what is plausible, in the unit.
     """
@@ -172,9 +172,10 @@ def _bad_values(given: MapInput, where: Where) -> dict[float, Quality]:
         for number in numbers if isinstance(numbers, list) else [numbers]:
             try:
                 raw: Any = int(number, 0) if isinstance(number, str) else number
-                found[float(raw)] = _BAD[quality]
-            except (TypeError, ValueError):
-                raise where.wrong(f"bad_values.{key}", number, "a number as in the registers") from None
+                found[as_decoded(float(raw), given.type)] = _BAD[quality]
+            except (TypeError, ValueError, OverflowError):
+                expected = f"a number as in the registers, which {given.type} can hold"
+                raise where.wrong(f"bad_values.{key}", number, expected) from None
     return found
 
 

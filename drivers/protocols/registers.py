@@ -43,3 +43,36 @@ def decode(words: Sequence[int], kind: str, word_order: str) -> float:
     ordered = words if word_order == "big" else list(reversed(words))
     (value,) = struct.unpack(_FORMATS[kind], struct.pack(f">{len(ordered)}H", *ordered))
     return float(value)
+
+
+def as_decoded(number: float, kind: str) -> float:
+    """Return what `decode` makes of the registers that hold a number.
+
+    A whole number may also be given by the bits of its registers, such as 0x8000 of an `int16`; a `float32` holds
+    -999.9 only nearly.
+
+    Parameters
+    ----------
+    number : float
+        A number as a manual states it.
+    kind : str
+        As in `decode`.
+
+    Raises
+    ------
+    ValueError, OverflowError
+        If the registers cannot hold it.
+
+    Examples
+    --------
+    >>> as_decoded(0x8000, "int16"), as_decoded(-1, "uint16"), as_decoded(-999.9, "float32")
+    (-32768.0, 65535.0, -999.9000244140625)
+    """
+    form = _FORMATS[kind]
+    if kind == "float32":
+        return float(struct.unpack(form, struct.pack(form, number))[0])
+    bits = 8 * struct.calcsize(form)
+    if number != int(number) or not -(1 << bits - 1) <= number < 1 << bits:
+        raise ValueError(f"{kind} cannot hold {number:g}")
+    (value,) = struct.unpack(form, (int(number) % (1 << bits)).to_bytes(bits // 8, "big"))
+    return float(value)

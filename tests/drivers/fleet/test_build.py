@@ -175,6 +175,14 @@ DEVICE_MISTAKES = [
         device("modbus-map", "bus", [{**RPM, "bad_values": {"x": "invalid"}}]),
         "expected a number as in the registers",
     ),
+    (
+        device("modbus-map", "bus", [{**RPM, "type": "int16", "bad_values": {"stale": [3276.7]}}]),
+        "expected a number as in the registers, which int16 can hold",
+    ),
+    (
+        device("modbus-map", "bus", [{**RPM, "type": "uint16", "bad_values": {"70000": "stale"}}]),
+        "expected a number as in the registers, which uint16 can hold",
+    ),
     (device("modbus-map", "bus", [{**RPM, "function": 1}]), "key 'function' is 1"),
     (device("capancdt-6200", "cap", [{"input": 0, "couple": "K"}]), "inputs[0]: key 'couple' is not known"),
     (device("capancdt-6200", "cap", [{"input": 0}], address=1), "key 'address' is not known"),

@@ -187,6 +187,27 @@ async def test_modbus_map(rig: Any, slave: Any) -> None:
     assert device.units == {0: "rpm", 1: "um", 2: "degc", 3: "a", 4: "w", 5: "rpm"}
 
 
+@pytest.mark.parametrize(
+    ("kind", "words", "number"),
+    [
+        ("float32", [0xC479, 0xF99A], -999.9),
+        ("float32", [0x454C, 0xCB33], 3276.7),
+        ("int16", [0x8000], "0x8000"),
+        ("int16", [0x8000], -32768),
+        ("uint16", [0xFFFF], -1),
+        ("int32", [0x8000, 0x0000], 0x80000000),
+    ],
+)
+async def test_a_fault_number_is_recognised_as_the_registers_hold_it(
+    rig: Any, slave: Any, kind: str, words: list[int], number: float | str
+) -> None:
+    unit = slave()
+    unit.block(3, 100, words)
+    table = {"input": 0, "unit": "degc", "address": 100, "type": kind, "bad_values": {"open_circuit": [number]}}
+    _, _, [device] = await rig.modbus({1: unit}, {"model": "modbus-map", "address": 1, "inputs": [table]})
+    assert (await device.read())[0].quality is Quality.OPEN
+
+
 async def test_modbus_map_reads_small_gaps_along_when_told(rig: Any, slave: Any) -> None:
     unit = slave()
     unit.block(3, 100, list(range(11)))
