@@ -38,6 +38,8 @@ Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 RecordNumber = Annotated[int, Meta(ge=-1, le=2**32 - 1)]
 #: Period of samples as a model file may have it, s.
 PeriodS = Annotated[float, Meta(ge=0.1, le=3600.0)]
+#: Validity of an offset, s: of the longest samples two and a half, and a margin. Beyond it nothing would ever expire.
+ValidForS = Annotated[float, Meta(gt=0.0, le=10_000.0)]
 
 #: Longest place of a number that is named, characters.
 _PLACE = 80
@@ -175,7 +177,7 @@ class Offset(Message, frozen=True, kw_only=True):
         Hash of the model file.
     """
 
-    valid_for_s: Number
+    valid_for_s: ValidForS
     y_offset_um: OffsetValue | None
     y_offset_rate_um_per_min: Number | None
     y_offset_std_um: Number | None

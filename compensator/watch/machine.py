@@ -161,6 +161,8 @@ class WatchedMachine:
         return self._update_other(message)
 
     def _update_offset(self, message: Offset, monotonic_s: float, asked: bool) -> bool:
+        if self._counts_anew(message, monotonic_s):
+            self.numbers, self._offset, self._axes = Sequence(), None, {}
         # Answers are not counted: until the subscription has reached every service, messages between an answer and
         # the first message received are not sent here.
         if not asked and not self.numbers.update(message.seq, message.time_utc_ns):
@@ -172,10 +174,28 @@ class WatchedMachine:
         self.history.prune(message.time_utc_ns)
         return True
 
+    def _counts_anew(self, message: Offset, monotonic_s: float) -> bool:
+        """Return whether a lower number is that of a service that counts anew, as after a new installation.
+
+        While the newest offset is valid it is a repetition. A repetition that comes later is shown with its own age.
+        """
+        known = self._offset
+        return (
+            known is not None
+            and message.machine == known.machine
+            and message.seq < known.seq
+            and monotonic_s - self._arrived_s > known.valid_for_s
+        )
+
+    def _is_older(self, message: Offset | Sample | EstimateMessage | Status, known: Any) -> bool:
+        """Return whether a message is no newer than the kept one, which belongs to the last offset or the next."""
+        ahead = self._offset is not None and known.seq > self._offset.seq + 1
+        return message.machine == known.machine and message.seq <= known.seq and not ahead
+
     def _update_axis(self, axis: str, message: AxisOffset) -> bool:
         """Keep the newest offset of a further axis."""
         known = self._axes.get(axis)
-        if known is not None and message.machine == known.machine and message.seq <= known.seq:
+        if known is not None and self._is_older(message, known):
             return False
         self._axes[axis] = message
         return True
@@ -201,7 +221,7 @@ class WatchedMachine:
         # Recorded estimates and status of several axes are subclasses.
         name = next(name for name, kind in _KEPT.items() if isinstance(message, kind))
         known = getattr(self, name)
-        if known is not None and message.machine == known.machine and message.seq <= known.seq:
+        if known is not None and self._is_older(message, known):
             return False
         setattr(self, name, message)
         return True

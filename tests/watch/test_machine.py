@@ -150,6 +150,39 @@ def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -
     assert 99.0 not in heard.shop.history("shop/vmc-07")["y_offset_um"]
 
 
+def test_a_service_that_counts_anew_is_shown_once_the_newest_offset_has_expired(heard: Heard) -> None:
+    high = 10**11
+    heard.hear(offset=offset(high), sample=sample(high, t_q=50.0), estimate=estimate(high), status=status(high))
+    for number in (5, 6, 7):
+        heard.clock.advance(60)
+        heard.hear(offset=offset(number, heard.clock.now_ns, state="hold"))
+        if number == 6:
+            assert (heard.machine["shown"], heard.machine["seq"], heard.machine["repeated"]) == ("ok", high, 2)
+    now_ns = heard.clock.now_ns
+    heard.hear(sample=sample(7, now_ns), estimate=estimate(7, now_ns, y_um=1.0), status=status(7, now_ns, model="new"))
+    machine = heard.machine
+    assert (machine["shown"], machine["seq"], machine["t_q_degc"], machine["y_um"], machine["model"]) == (
+        "hold",
+        7,
+        31.5,
+        1.0,
+        "new",
+    )
+    assert (machine["missed"], machine["repeated"]) == (0, 0)
+
+
+def test_a_number_ahead_of_the_offsets_keeps_no_later_message_out(heard: Heard) -> None:
+    heard.hear(offset=offset(5), sample=sample(10**11, t_q=50.0), status=status(10**11, model="forged"))
+    heard.hear(sample=sample(5), status=status(5))
+    assert (heard.machine["t_q_degc"], heard.machine["model"]) == (31.5, "quill")
+
+
+@pytest.mark.parametrize("valid_for_s", [1e30, 10_001.0, 0.0, -1.0])
+def test_an_offset_that_never_expires_is_none(heard: Heard, valid_for_s: float) -> None:
+    heard.hear(offset=offset(5, valid_for_s=valid_for_s))
+    assert (heard.machine["shown"], heard.machine["malformed"]) == ("unknown", 1)
+
+
 def test_answers_to_a_question_are_nothing_repeated_or_missed(heard: Heard) -> None:
     heard.shop.receive(KEY + "y/offset", offset(5), asked=True)
     heard.hear(offset=offset(8))
