@@ -8,9 +8,12 @@ from typing import Any
 from compensator.clock import Clock
 from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, encode
+from compensator.receiver.reasons import printable
 
 #: Largest number of events that are kept for the recording; beyond that the oldest are dropped.
 WAITING_EVENTS = 1000
+#: Longest text of an event, characters: it may cite what somebody has sent.
+LONGEST_TEXT = 2000
 
 
 class EventLog:
@@ -25,14 +28,14 @@ class EventLog:
         self.sequence = sequence
 
     def note(self, kind: EventKind, text: str, data: Mapping[str, Any] | None = None) -> None:
-        """Publish an event and keep it for the recording."""
+        """Publish an event and keep it for the recording; its text is one line, whatever it cites."""
         event = Event(
             schema=SCHEMA,
             machine=self._machine,
             seq=self.sequence,
             time_utc_ns=self._clock.utc_ns(),
             kind=kind,
-            text=text,
+            text=printable(text, LONGEST_TEXT),
             data=dict(data or {}),
         )
         # Bounded, so that memory does not grow if nothing can be recorded.

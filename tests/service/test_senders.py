@@ -100,6 +100,16 @@ async def test_a_mode_that_is_no_text_is_refused_in_words(tmp_path: Path) -> Non
     assert replies[0]["ok"] is False and replies[0]["text"].startswith("zero list: expected zero with mode auto")
 
 
+@pytest.mark.parametrize("cited", ["\nstate: ok \x1b[31m", 900_000 * "x"], ids=["line", "long"])
+async def test_a_refusal_is_one_short_line_in_the_log_whatever_it_cites(tmp_path: Path, cited: str) -> None:
+    bench = replayable(tmp_path)
+    payloads = [json.dumps(said).encode() for said in ({"model": "x", "sha256": cited}, {cited: 1})]
+    bench.at_sample[2] = lambda: [bench.daemon.command("adopt", payload, ANNA) for payload in payloads]
+    await bench.run(4)
+    texts = [event["text"] for event in events(tmp_path / "rec", "command_refused")]
+    assert len(texts) == 2 and all(text.isprintable() and len(text) <= 2000 for text in texts)
+
+
 async def test_the_recording_says_who_commanded_whatever_the_payload_says(tmp_path: Path) -> None:
     bench = replayable(tmp_path)
     liar = b'{"mode": "warm", "by": "the boss", "by_proof": "certificate"}'
