@@ -68,6 +68,8 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     set_key(config, "transport/shared_memory/enabled", False)
     # The liveliness token of a dead service expires after this time, ms, if the network does not report the loss.
     set_key(config, "transport/link/tx/lease", 4000)
+    if settings.listen:
+        bound_silent(config)
     if settings.mode == "router":
         enlarge_queues(config)
     if settings.secured():
@@ -123,9 +125,10 @@ def services_text(alive: Collection[str]) -> str:
 
 
 def bound_silent(config: zenoh.Config) -> None:
-    """Let a router bear connections that are silent before they authenticate.
+    """Let a router, or a service that listens itself, bear connections that are silent before they authenticate.
 
-    With Zenoh's own 100 places of 10 s, 200 of them keep a newcomer out for 10 s.
+    With Zenoh's own 100 places of 10 s, 200 of them keep a newcomer out for 10 s, and longer where they come again.
+    After a power cut all services of a shop connect at once, with two sessions each.
     """
     pending = get(config, "transport/unicast/accept_pending") or 0
     timeout_ms = get(config, "transport/unicast/accept_timeout") or ACCEPT_TIMEOUT_MS
@@ -137,10 +140,8 @@ def enlarge_queues(config: zenoh.Config) -> None:
     """Enlarge a router's queues for a whole shop that publishes at the same instant.
 
     Services with synchronised clocks publish at the same time, and messages that do not fit into a client's queue are
-    dropped. A queue has at most 16 packets of 64 KiB. After a power cut all services connect at once, with two sessions
-    each; by default Zenoh accepts 100 at a time.
+    dropped. A queue has at most 16 packets of 64 KiB.
     """
-    bound_silent(config)
     for priority in ("interactive_high", "data"):
         set_key(config, f"transport/link/tx/queue/size/{priority}", 16)
 

@@ -6,9 +6,11 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,8 +23,9 @@ from compensator.cli import main
 from compensator.commands.router import _LinkLog, checked
 from compensator.config import Zenoh
 from compensator.service.command_client import operator_of_file
-from compensator.service.session import get, read_config_file, tls_files
-from tests.security.shop import DEPLOY, Shop, script
+from compensator.service.publisher import Publisher
+from compensator.service.session import alive_services, client_config, get, read_config_file, tls_files
+from tests.security.shop import DEPLOY, Shop, free_port, script
 
 
 def test_the_router_serves_says_who_comes_and_ends_on_sigterm(shop: Shop, tmp_path: Path) -> None:
@@ -187,6 +190,16 @@ def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:
 def _zenoh(path: Path) -> dict[str, Any]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))["zenoh"]
     return {key: str(path.parent / value) if key.startswith("tls_") else value for key, value in table.items()}
+
+
+def test_a_receiver_reaches_a_service_beside_silent_connections() -> None:
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", listen=[f"tcp/127.0.0.1:{port}"])
+    with Publisher(settings, lambda *_: {"ok": True, "text": ""}), ExitStack() as silent:
+        for _ in range(200):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+        with zenoh.open(client_config(settings, settings.listen)) as session:
+            assert alive_services(session, 2.0) == ["shop/vmc-07"]
 
 
 def test_a_router_bears_silent_connections_also_with_a_file_of_ones_own(tmp_path: Path) -> None:
