@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -132,8 +133,8 @@ def rewrite(
             if _digest(part, yielding) != copy.digest():
                 raise DataError(f"{part}: the copy differs from the original when read back")
             part.replace(path)
-        except McapError as error:
-            raise DataError(f"{path}: {error}") from error
+        except (McapError, ValueError, struct.error) as error:  # a number, hash or text that no recorder writes
+            raise DataError(f"{path}: not as a recorder writes it: {error}") from error
         finally:
             part.unlink(missing_ok=True)
     sync_folder(path.parent)

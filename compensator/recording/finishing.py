@@ -308,7 +308,9 @@ class _ChainedCopy(Copy):
     def _append(self, topic: str, data: bytes) -> None:
         """Add a message after the last one."""
         assert self._last is not None
-        channel = next(number for number, name in self.topics.items() if name == topic)
+        channel = next((number for number, name in self.topics.items() if name == topic), None)
+        if channel is None:
+            raise DataError(f"no channel /{topic}, expected the channels of the recorder")
         sequence, time_ns = self._last.sequence + 1, self._last.log_time_ns
         self.add(Message(channel, sequence, time_ns, chain.body_of(sequence, time_ns, data)))
 

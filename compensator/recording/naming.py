@@ -10,6 +10,8 @@ from pathlib import Path
 from compensator.clock import NS
 
 _STAMP = "%Y%m%dT%H%M%SZ"
+#: Number of a file within its second. A name may also come from a recording's metadata, with thousands of digits.
+_NUMBER = re.compile(r"[0-9]{1,9}")
 _NAME = re.compile(r"(?P<of>.+)_[0-9]{8}T[0-9]{6}Z(-[0-9]{3,4})?\.mcap")
 
 
@@ -57,7 +59,7 @@ def order_of(stem: str) -> tuple[str, int]:
     ['m-7_20260105T060000Z', 'm-7_20260105T060000Z-999', 'm-7_20260105T060000Z-1000']
     """
     stamp, dash, number = stem.rpartition("-")
-    return (stamp, int(number)) if dash and number.isdecimal() and number.isascii() else (stem, 0)
+    return (stamp, int(number)) if dash and _NUMBER.fullmatch(number) else (stem, 0)
 
 
 def is_name(path: Path, of: str) -> bool:

@@ -12,7 +12,7 @@ import pytest
 from compensator.audit.findings import Finding
 from compensator.audit.series import Audit, audit
 from compensator.recording.container import Attachment, Contents
-from compensator.recording.reading import recordings
+from compensator.recording.reading import in_order, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import Line, find, group, lines_of, rewrite, with_new_values
 from tests.service.simulated import START_NS
@@ -309,6 +309,19 @@ def test_what_the_file_opens_with_is_covered(
 ) -> None:
     rewrite(second(folder), contents=edit)
     assert (kind, name) in {(f.kind, f.topic) for f in look(folder).findings}
+
+
+def test_a_name_with_thousands_of_digits_in_the_metadata_is_named(folder: Path) -> None:
+    """Python reads no number that long; the other files are audited nonetheless."""
+
+    def numbered(contents: Contents) -> None:
+        contents.run["file"] = f"{MACHINE}_20260105T000000Z-{'1' * 5000}.mcap"
+
+    rewrite(second(folder), contents=numbered)
+    found = look(folder)
+    assert found.samples == 46
+    assert any(finding.file == second(folder).name and finding.topic == "metadata run" for finding in found.findings)
+    assert in_order(recordings(folder, MACHINE))
 
 
 def test_an_attachment_added_later_is_named(folder: Path) -> None:

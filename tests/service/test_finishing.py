@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,11 @@ from mcap.reader import NonSeekingReader, make_reader
 from compensator.audit.series import audit
 from compensator.errors import DataError
 from compensator.recording import compaction, finishing
+from compensator.recording.container import Contents
 from compensator.recording.finishing import Finisher, Retention, compact
 from compensator.recording.reading import read_messages, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
-from tests.audit.tampering import end_of_chain, lines_of, rewrite
+from tests.audit.tampering import Line, end_of_chain, lines_of, rewrite
 from tests.service.simulated import START_NS
 
 DAY_NS = 1440 * MINUTE_NS
@@ -159,6 +161,41 @@ def test_a_pipe_with_the_name_of_a_recording_is_refused_and_the_service_ends(tmp
     finally:
         os.close(os.open(pipe, os.O_RDWR))  # where it waits for a writer, it has one now
         service.stop()
+
+
+def _other_hash(contents: Contents) -> None:
+    contents.run["previous_chain"] = "no hash"
+
+
+def _no_seals(contents: Contents) -> None:
+    number = next(number for number, channel in contents.channels.items() if channel.topic == "/seal")
+    del contents.channels[number]
+
+
+def _last_number(lines: list[Line]) -> list[Line]:
+    return [*lines[:-1], replace(lines[-1], sequence=2**32 - 1)]
+
+
+@pytest.mark.parametrize(
+    ("edit", "contents"),
+    [(list, _other_hash), (list, _no_seals), (_last_number, None)],
+    ids=["a hash that is none", "a channel is missing", "the last number of a record"],
+)
+def test_what_no_recorder_writes_stays_and_later_files_are_finished(
+    tmp_path: Path, edit: Callable[[list[Line]], list[Line]], contents: Callable[[Contents], None] | None
+) -> None:
+    path = live(tmp_path, 5)
+    rewrite(path, edit, contents=contents, chunked=False)
+    path.write_bytes(path.read_bytes()[:-30])  # without its end, as a kill leaves it
+    data = path.read_bytes()
+    service = Service(tmp_path, seq=10).run(5)
+    service.recorder._finisher.wait()
+    service.recorder.start_new()
+    service.run(5).stop()
+    assert path.read_bytes() == data
+    assert any(f"{path.name}: could not be compacted" in text for text, _ in service.recorder.remarks())
+    later = [end_of_chain(one) for one in recordings(tmp_path, MACHINE)[1:]]
+    assert len(later) == 2 and all(end is not None and end.chunked for end in later)
 
 
 def test_older_and_damaged_files_are_left_alone(tmp_path: Path) -> None:
