@@ -14,6 +14,9 @@ from typing import TextIO
 from compensator.errors import UsageError
 from compensator.input_file import resolved
 
+#: The disk, a quota or the largest file is full, or nobody reads the pipe any more.
+_OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE)
+
 
 @contextmanager
 def atomic_write(path: Path, *, may_stream: bool = False) -> Iterator[TextIO]:
@@ -29,14 +32,14 @@ def atomic_write(path: Path, *, may_stream: bool = False) -> Iterator[TextIO]:
     Yields
     ------
     typing.TextIO
-        Open for UTF-8 text; line ends are written unchanged.
+        Open for UTF-8 text; line ends are written unchanged, what is no UTF-8 in the name of a file escaped.
 
     Raises
     ------
     UsageError
         If the folder does not exist.
     OSError
-        If the target is another device, pipe or folder; it is kept.
+        If the target is another device, pipe or folder, or the disk is full; it is kept, and the error names it.
 
     Examples
     --------
@@ -48,7 +51,7 @@ def atomic_write(path: Path, *, may_stream: bool = False) -> Iterator[TextIO]:
     ['a.csv']
     """
     if may_stream and is_stream(path):
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with _naming(path), path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
             yield file
         return
     path = resolved(path)
@@ -56,7 +59,7 @@ def atomic_write(path: Path, *, may_stream: bool = False) -> Iterator[TextIO]:
     _require_regular(path)
     with (
         _replacement(path, 0o600) as descriptor,
-        os.fdopen(descriptor, "w", newline="", encoding="utf-8") as file,
+        os.fdopen(descriptor, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
     ):
         yield file
         file.flush()
@@ -143,13 +146,25 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Let an error that only a write gives name its file; what is read meanwhile has others."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno in _OF_WRITES:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def _replacement(path: Path, mode: int) -> Iterator[int]:
     """Open a new file in the same folder; at the end it replaces the target, after an error it is removed."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(temporary, flags, mode)
     try:
-        yield descriptor
+        with _naming(path):
+            yield descriptor
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

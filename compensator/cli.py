@@ -9,13 +9,16 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import io
 import json
 import logging
+import os
 import re
 import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from compensator import __version__
@@ -24,7 +27,7 @@ from compensator.commands import Answer, arguments
 from compensator.commands.outputs import check_outputs
 from compensator.commands.stopping import stoppable, was_interrupted
 from compensator.commands.wrapping import styled, wrapped
-from compensator.errors import CompensatorError
+from compensator.errors import CompensatorError, one_line
 from drivers.errors import DriverError
 
 log = logging.getLogger("compensator")
@@ -145,6 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; by default those of `sys.argv`.
     """
+    _have_streams()
     try:
         stoppable()
     except KeyboardInterrupt:  # it waited
@@ -162,11 +166,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:
             raise
-        log.error("compensator: %s", shortened(_in_words(error)))
+        log.error("compensator: %s", shortened(one_line(_in_words(error))))
         result = getattr(error, "result", None)
-        if given.json and result is not None:
-            sys.stdout.write(f"{json.dumps(result)}\n")
-        return getattr(error, "exit_code", 1)
+        code = getattr(error, "exit_code", 1)
+        return _printed(json.dumps(result), code) if given.json and result is not None else code
     except KeyboardInterrupt:
         return 130
     if was_interrupted():
@@ -174,11 +177,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     if answer is None:
         return 0
     text = json.dumps(answer.result) if given.json else answer.text
-    if sys.stdout.isatty() and not given.json:
-        _show(wrapped(text, shutil.get_terminal_size().columns))
-        return answer.code
-    sys.stdout.write(f"{text}\n")
-    return answer.code
+    return _printed(text, answer.code, for_people=not given.json)
+
+
+def _have_streams() -> None:
+    """Open the standard streams that are closed, and let the others write every character.
+
+    Else a file that is opened, such as a recording, would get the number of one, and what a library writes to it.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115  it stays open
+        elif isinstance(stream, io.TextIOWrapper) and mode == "w":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _printed(text: str, code: int, *, for_people: bool = False) -> int:
+    """Print a result and return the exit code; it is that of a failure if nobody could read the result."""
+    try:
+        if for_people and sys.stdout.isatty():
+            _show(wrapped(text, shutil.get_terminal_size().columns))
+        else:
+            sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()
+    except OSError as error:
+        log.error("compensator: standard output: %s", error.strerror or error)
+        # What it holds is written again when Python ends.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+        return 1
+    return code
 
 
 def _show(text: str) -> None:

@@ -54,3 +54,16 @@ class ServiceError(CompensatorError):
     def __init__(self, text: str, result: Mapping[str, Any] | None = None) -> None:
         super().__init__(text)
         self.result = result
+
+
+def one_line(text: str) -> str:
+    r"""Return a text with line ends, control characters and marks of the direction escaped.
+
+    It may cite a name or a value of a stranger, who could otherwise write lines of his own on a terminal.
+
+    Examples
+    --------
+    >>> one_line("name\n\x1b[2J✓ Proven")
+    'name\\n\\x1b[2J✓ Proven'
+    """
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)

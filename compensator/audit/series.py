@@ -15,7 +15,7 @@ from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
 from compensator.audit.verdict import partly, verdict
 from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
-from compensator.errors import DataError, UsageError
+from compensator.errors import DataError, UsageError, one_line
 from compensator.recording.chain import NOTHING
 from compensator.recording.head import read_head
 from compensator.recording.naming import named_of, order_of
@@ -455,7 +455,7 @@ def summary(found: Audit) -> str:
         lines.append(f"{found.findings_count} finding(s):")
         lines += [f"  {finding.line()}" for finding in found.findings]
     lines += [f"remark: {remark}" for remark in _shortened([remark.marked for remark in found.remarks])]
-    return "\n".join(lines)
+    return "\n".join(map(one_line, lines))  # names in them are those of the files
 
 
 def _shortened(remarks: Sequence[str], most: int = 20) -> list[str]:

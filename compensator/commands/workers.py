@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
@@ -33,7 +34,7 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     Raises
     ------
     ServiceError
-        If the scheduler does not answer, or its workers are missing or of another version.
+        If the scheduler does not answer, its workers are missing or of another version, or a process was ended.
     UsageError
         If Dask is not installed, or the address is invalid.
     """
@@ -49,6 +50,9 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             yield pool
+        except BrokenProcessPool as error:
+            words = f"one of {count} processes was ended from outside, as the system does where memory runs out"
+            raise ServiceError(f"{words}; free some, and start again") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

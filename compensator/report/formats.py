@@ -149,12 +149,18 @@ def write(path: Path, page: Page) -> Path:
         if suffix == ".pdf":
             # Older browsers ignore the rule of the print style that opens details.
             source.write_text(
-                html_of(page, date=today(), can_zoom=False).replace("<details>", "<details open>"), encoding="utf-8"
+                html_of(page, date=today(), can_zoom=False).replace("<details>", "<details open>"),
+                encoding="utf-8",
+                errors="backslashreplace",
             )
             options = ["--no-pdf-header-footer", "--print-to-pdf-no-header", f"--print-to-pdf={printed}"]
         else:
             first = _first_figure(page)
-            source.write_text(html_of(_excerpt(page, first), date=today(), can_zoom=False), encoding="utf-8")
+            source.write_text(
+                html_of(_excerpt(page, first), date=today(), can_zoom=False),
+                encoding="utf-8",
+                errors="backslashreplace",
+            )
             height = _PNG_HEAD + round(_PNG_WIDTH / 9.0 * (first.full_height if first else 0.0))
             options = [f"--window-size={_PNG_WIDTH},{height}", f"--force-device-scale-factor={_PNG_SCALE}"]
             options += ["--hide-scrollbars", f"--screenshot={printed}"]

@@ -45,6 +45,17 @@ def test_a_difference_is_exit_code_3_and_named_field_by_field(rec: Path, capsys:
     assert f"{rec.name}: altered: /offset record" in out and "bit for bit" not in out
 
 
+def test_a_name_in_the_metadata_writes_no_lines_of_its_own(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def named(contents: Contents) -> None:
+        contents.run["machine"] = contents.run["file"] = "x\n\x1b[2J\u202e✓ Proven: 1440 samples"
+
+    rewrite(rec, contents=named)
+    assert main(["replay", str(rec)]) == 3
+    out = capsys.readouterr().out
+    assert out.replace("\n", "").isprintable() and "x\\n\\x1b[2J\\u202e✓ Proven" in out
+    assert not [line for line in out.splitlines() if line.startswith("✓")]
+
+
 def test_the_result_as_json(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "--json", str(rec.parent)]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 from compensator.errors import ServiceError
 
@@ -12,3 +13,8 @@ def job(number: int, refused: bool = False) -> tuple[int, int]:
     if refused:
         raise ServiceError(f"job {number} cannot be done")
     return number, os.getpid()
+
+
+def ended_job() -> None:
+    """End its process, as the system does where memory runs out."""
+    os.kill(os.getpid(), signal.SIGKILL)

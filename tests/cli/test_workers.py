@@ -20,7 +20,7 @@ from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import write_table
 from compensator.errors import ServiceError
 from tests.audit.made import START_NS, Service
-from tests.cli.jobs import job
+from tests.cli.jobs import ended_job, job
 from tests.diagnose.scenarios import draw, record
 from tests.shared_folder import search_once
 
@@ -137,3 +137,9 @@ def test_independent_jobs_give_their_results_in_order_in_processes_of_their_own(
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     with pytest.raises(ServiceError, match="job 1 cannot be done"):
         in_parallel([partial(job, i, refused=i == 1) for i in range(3)], lambda done, total: None)
+
+
+def test_a_process_that_is_ended_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with pytest.raises(ServiceError, match="one of 2 processes was ended from outside"):
+        in_parallel([ended_job, ended_job], lambda done, total: None)
