@@ -17,6 +17,7 @@ from compensator.certificates import Certificate, check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
+from compensator.input_file import resolved
 from compensator.model.model_file import read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.signature import Signer
@@ -215,7 +216,7 @@ def head_file(loaded: LoadedConfig) -> Path | None:
     Raises
     ------
     ConfigError
-        If it is among the recordings, no regular file, or configured without a key.
+        If it is among the recordings, what the service reads, no regular file, or configured without a key.
     """
     recording = loaded.config.recording
     folder = loaded.resolve(recording.folder)
@@ -233,7 +234,24 @@ def head_file(loaded: LoadedConfig) -> Path | None:
         )
     if path.exists() and not path.is_file():
         raise ConfigError(f"{loaded.path}: recording.head = {str(path)!r}: is not a regular file, expected one")
+    for name, read in _read_by(loaded).items():
+        if path == resolved(read) or (path.exists() and read.exists() and path.samefile(read)):
+            words = f"is {name}, which it would replace, expected another file"
+            raise ConfigError(f"{loaded.path}: recording.head = {str(path)!r}: {words}")
     return path
+
+
+def _read_by(loaded: LoadedConfig) -> dict[str, Path]:
+    """Return the files that the service reads, by what they are."""
+    zenoh, key, model = loaded.config.zenoh, loaded.config.recording.signing_key, loaded.model_name()
+    files = {f"zenoh.{name}": getattr(zenoh, name) for name in ("tls_ca", "tls_certificate", "tls_key")}
+    found = {name: loaded.resolve(file) for name, file in files.items() if file is not None}
+    found["the configuration itself"] = loaded.path
+    if key is not None:
+        found["recording.signing_key"] = loaded.resolve(key)
+    if isinstance(model, Path):
+        found["model.file"] = model
+    return found
 
 
 # ---------------------------------------------------------------------- warnings

@@ -337,6 +337,11 @@ def test_where_the_head_is_kept(tmp_path: Path) -> None:
         config('recording.signing_key = "machine.pem"', f'recording.head = "{head}"')
         with pytest.raises(ConfigError, match="is not a regular file"):
             head_file(load_config(path))
+    (tmp_path / "other.pem").hardlink_to(tmp_path / "machine.pem")
+    for head in ("machine.pem", "folder/../machine.pem", "other.pem", "machine.toml"):
+        config('recording.signing_key = "machine.pem"', f'recording.head = "{head}"')
+        with pytest.raises(ConfigError, match="which it would replace"):
+            head_file(load_config(path))
 
 
 def test_what_lies_behind_the_head_is_counted_from_it(shop: Shop) -> None:
