@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import math
+import pickle
 import re
-import warnings
+import signal
+import subprocess
+import sys
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +18,10 @@ from typing import Any
 import numpy as np
 
 from compensator.codes import DataRemark, ProbeCode, Remark
+from compensator.data import mat_reader
 from compensator.data.cells import text_of, with_points
 from compensator.data.frames import table_in_memory
+from compensator.data.mat_reader import DAMAGED
 from compensator.data.table import DATA_ROLES, TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Probe, number
@@ -37,8 +41,6 @@ _OTHER_FILES = (
 TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 10_000_000, 50_000_000
 #: First line by which Excel names the separator.
 _SEPARATOR = re.compile(r"sep=([,;\t])", re.IGNORECASE)
-#: What scipy raises for a damaged MAT file, besides its own error.
-_DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 #: How to save what only MATLAB can read.
 _AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
 
@@ -124,19 +126,13 @@ def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark,
     DataError
         If the file is of version 7.3, holds an object such as a `table`, or no columns.
     """
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about objects that it cannot read; the error below names them
-            content = loadmat(path, squeeze_me=True, mat_dtype=False)
-    except NotImplementedError as error:
+    content = _variables(path)
+    if isinstance(content, NotImplementedError):
         raise DataError(
             f"{path}: a MAT file of version 7.3 (HDF5), expected version 7: save(FILE, ..., '-v7'), or a CSV; {_AS_CSV}"
-        ) from error
-    except (MatReadError, *_DAMAGED) as error:
-        raise DataError(f"{path}: not a MAT file that can be read ({str(error)[:80]}); {_AS_CSV}") from error
+        ) from content
+    if isinstance(content, Exception):
+        raise DataError(f"{path}: not a MAT file that can be read ({str(content)[:80]}); {_AS_CSV}") from content
     columns: Mapping[str, Any] = {name: value for name, value in content.items() if not name.startswith("__")}
     while len(columns) == 1 and (fields := _fields(next(iter(columns.values())))):
         columns = fields
@@ -156,6 +152,19 @@ def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark,
     shown = ", ".join(f"{name} ({' × '.join(map(str, arrays[name].shape))})" for name in others)
     words = f"{path}: left out, not one value for each of {time.size} rows: {shown}."
     return table, (Remark(DataRemark.VARIABLES_LEFT_OUT, words),)
+
+
+def _variables(path: Path) -> dict[str, Any] | Exception:
+    """Return the variables of a MAT file, or why there are none."""
+    # Unsafe paths are left out (-P): a module in the folder of the data is no part of this program.
+    command = (sys.executable, "-P", str(Path(mat_reader.__file__)), str(path.absolute()))
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    if done.returncode < 0:
+        return DataError(f"its reader was ended by {signal.Signals(-done.returncode).name}")
+    if done.returncode:
+        return DataError(done.stderr.decode(errors="replace").strip().rpartition("\n")[2])
+    found: dict[str, Any] | Exception = pickle.loads(done.stdout)
+    return found
 
 
 def _fields(value: Any) -> Mapping[str, Any]:
@@ -180,7 +189,7 @@ def read_workbook(path: Path, roles: Mapping[str, str]) -> Table:
     except ImportError as error:
         needs = "an Excel workbook, which needs pandas and openpyxl"
         raise DataError(f"{path}: {needs}; install them, or {as_csv}") from error
-    except (zipfile.BadZipFile, *_DAMAGED) as error:
+    except (zipfile.BadZipFile, *DAMAGED) as error:
         why = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
         raise DataError(f"{path}: not a workbook that can be read ({why}); {as_csv}") from error
     return table_in_memory(str(path), frame, roles, rows=range(2, len(frame) + 2))

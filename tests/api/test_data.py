@@ -189,6 +189,18 @@ def test_vectors_and_structs_of_matlab_are_tables(tmp_path: Path, run: Path, as_
     same(records(path), records(run))
 
 
+@pytest.mark.parametrize(("place", "value"), [(144, 109), (145, 255)], ids=["class", "flags"])
+def test_a_damaged_file_of_matlab_ends_its_reader_alone(tmp_path: Path, place: int, value: int) -> None:
+    """A byte that scipy's reader believes: it ends its process, or has no words for it."""
+    path = tmp_path / "run.mat"
+    savemat(path, SMALL)
+    data = bytearray(path.read_bytes())
+    data[place] = value
+    path.write_bytes(data)
+    with pytest.raises(tc.CompensatorError, match=r"not a MAT file that can be read \("):
+        tc.read(path)
+
+
 def test_matrices_among_vectors_are_left_out_with_a_remark(tmp_path: Path) -> None:
     others = {"A": np.eye(3), "frames": np.zeros((3, 2, 2)), "b": [1.0, 2.0], "Ts": 60.0}
     savemat(tmp_path / "run.mat", SMALL | others)

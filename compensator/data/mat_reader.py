@@ -1,0 +1,33 @@
+"""What scipy reads of a MAT file, by a process of its own that `files.py` starts: `python mat_reader.py FILE`.
+
+scipy's reader is compiled code that believes what a file says of its parts, so one wrong byte can end the process that
+reads it. This one imports nothing of the project and writes what was read, or the error, to its output.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import warnings
+import zlib
+
+#: What scipy raises for a damaged file, besides its own error.
+DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
+
+
+def main() -> None:
+    """Read the file that the argument names."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    warnings.simplefilter("ignore")  # about objects that it cannot read
+    found: object
+    try:
+        found = loadmat(sys.argv[1], squeeze_me=True, mat_dtype=False)
+    except (NotImplementedError, MatReadError, *DAMAGED) as error:
+        found = error
+    pickle.dump(found, sys.stdout.buffer)
+
+
+if __name__ == "__main__":
+    main()
