@@ -12,7 +12,7 @@ from compensator.errors import ConfigError
 from compensator.input_file import resolved
 from compensator.probes.probe import Convention
 from compensator.receiver import ReceiverError
-from compensator.receiver.settings import load_tables, read_table
+from compensator.receiver.settings import check_apart, load_tables, read_table
 
 #: µm for each unit of a control.
 UNITS_UM = {"mm": 1000.0, "inch": 25400.0}
@@ -237,6 +237,7 @@ def _service(path: Path, table: Mapping[str, Any]) -> Service:
     files: dict[str, Any] = {
         key: _absolute(path, getattr(service, key)) for key in ("zenoh_config", "applied_file", "state_file")
     }
+    check_apart(files, source=str(path), name="probes")
     return replace(service, **files)
 
 

@@ -293,7 +293,30 @@ def source_from(kind: type[S], table: Mapping[str, Any], *, source: str, folder:
         key: _absolute(folder / getattr(settings, key)) if getattr(settings, key) else ""
         for key in ("zenoh_config", "state_file", "applied_file")
     }
+    check_apart(absolute, source=source, name="receiver")
     return replace(settings, **absolute)
+
+
+def check_apart(files: Mapping[str, str], *, source: str, name: str) -> None:
+    """Refuse a file that two keys name, or that holds these settings: what is written would replace it.
+
+    Parameters
+    ----------
+    files : mapping of str to str
+        Absolute paths by key; an empty one is not given.
+    source, name : str
+        File with the settings, and table, for messages.
+
+    Raises
+    ------
+    ReceiverError
+        If there is one.
+    """
+    taken = {_absolute(Path(source)): "the file with these settings"}
+    for key, file in files.items():
+        there = taken.setdefault(file, f"{name}.{key}") if file else ""
+        if there not in ("", f"{name}.{key}"):
+            raise ReceiverError(f"{source}: {name}.{key} = {file!r}: is {there}, expected a file of its own")
 
 
 def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: str) -> T:

@@ -64,6 +64,7 @@ def test_all_sources_with_absolute_paths(tmp_path: Path) -> None:
         ("connect =", "connects =", "probes.connects: unknown key"),
         ('connect = ["tcp/127.0.0.1:7447"]', "", "probes.connect = []: expected addresses"),
         ('state_file = "probes-state.json"', "", "probes.state_file: missing"),
+        ('"probes-state.json"', '"probes.toml"', "probes.toml': is the file with these settings, expected a file"),
         ('path = "in"', "", "folder.path: missing"),
         ('path = "in"', 'path = "in"\npattern = "a/*.csv"', "folder.pattern"),
         ("sign = 1\nsign_checked", "sign_checked", "folder.sign: missing; determine the sign"),

@@ -83,6 +83,12 @@ def test_settings_of_a_file(tmp_path: Path) -> None:
         ("offset_max_um = 100", 'offset_max_um = "100"', "receiver.offset_max_um = '100': expected a number"),
         ("offset_max_um = 100", "offset_max_um = nan", "receiver.offset_max_um = nan"),
         ("[axis]", "offset_max = 1\n[axis]", "receiver.offset_max: unknown key"),
+        (
+            '"state.json"',
+            '"receiver.toml"',
+            "receiver.toml': is the file with these settings, expected a file of its own",
+        ),
+        ("[axis]", 'applied_file = "x/../state.json"\n[axis]', "state.json': is receiver.state_file, expected a file"),
         ("connect =", "connected =", "unknown key"),
         ('connect = ["tcp/127.0.0.1:7447"]', "", "receiver.connect = []: expected addresses"),
         ('"shop/vmc-07"', '"shop/**"', "receiver.prefix = 'shop/**'"),
