@@ -172,6 +172,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _printed(json.dumps(result), code) if given.json and result is not None else code
     except KeyboardInterrupt:
         return 130
+    except ImportError:  # so a compiled module answers to an interrupt
+        if was_interrupted():
+            return 130
+        raise
     if was_interrupted():
         return 130
     if answer is None:

@@ -59,6 +59,11 @@ def _number(low: float, high: float) -> Callable[[str], float]:
     return number
 
 
+def _timeout(parser: argparse.ArgumentParser, default_s: float) -> None:
+    words = f"how long to wait for the service's reply, s ({default_s:g})"
+    parser.add_argument("--timeout", type=_number(0.0, 86_400.0), default=default_s, metavar="S", help=words)
+
+
 def demo(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `demo`."""
     add = parser.add_argument
@@ -264,7 +269,7 @@ def dismiss(parser: argparse.ArgumentParser) -> None:
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
-    add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
+    _timeout(parser, 5.0)
 
 
 def back(parser: argparse.ArgumentParser) -> None:
@@ -277,7 +282,7 @@ def back(parser: argparse.ArgumentParser) -> None:
         "state; its standard deviation is then larger"
     )
     add("--force", action="store_true", help=words)
-    add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
+    _timeout(parser, 60.0)
 
 
 def hold(parser: argparse.ArgumentParser) -> None:
@@ -291,7 +296,7 @@ def hold(parser: argparse.ArgumentParser) -> None:
     )
     add("--prefix", metavar="PREFIX", help="zenoh.prefix of the machine, such as shop/vmc-07")
     add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
-    add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
+    _timeout(parser, 5.0)
 
 
 resume = hold

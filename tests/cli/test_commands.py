@@ -382,6 +382,9 @@ def test_explain_knows_every_state_and_refuses_others(capsys: pytest.CaptureFixt
         ["check"],
         ["report"],
         ["hold", "--timeout", "soon"],
+        ["hold", "--timeout", "nan"],
+        ["adopt", "quill", "--config", "machine.toml", "--timeout", "1e30"],
+        ["dismiss", "--config", "machine.toml", "--timeout=-1"],
         ["watch", "--conect"],
     ],
 )

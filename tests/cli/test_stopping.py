@@ -171,3 +171,17 @@ def test_an_interrupt_that_python_drops_is_not_taken_for_success(
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
     assert cli_main(["check", "--config", "machine.toml"]) == 130
     assert "done" not in capsys.readouterr().out
+
+
+def test_an_interrupt_that_an_import_answers_to_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiled module that is interrupted while it is made says that its initialization failed."""
+
+    def command(_: object) -> Answer:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+        return Answer({}, "done")
+
+    monkeypatch.setattr("compensator.cli.load", lambda name: command)
+    assert cli_main(["check", "--config", "machine.toml"]) == 130
