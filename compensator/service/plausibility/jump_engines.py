@@ -309,6 +309,10 @@ class JumpEngines:
         one = self.believing.estimate
         return one is not None and abs(self.believing.grown_um - self.shifted.grown_um) <= one.y_std_um
 
+    def fits_y(self, grown_um: float, std_um: float) -> bool:
+        """Return whether a value of Y, see `speaks`, agrees with the believing engine."""
+        return abs(grown_um - self.believing.grown_um) < _FITS * std_um
+
     def speaks(self, grown_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
 

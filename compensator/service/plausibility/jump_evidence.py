@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from compensator.service.plausibility.jump_engines import JumpEngines
 from compensator.service.plausibility.jump_state import JumpState
@@ -13,11 +14,28 @@ _AGREES, _AGREES_SAMPLES = 12.0, 10
 _REFUTED = 12.0
 #: Consecutive samples for which Y must speak for a channel.
 _Y_SAMPLES = 10
+#: The same by the change since the zero alone. An engine that is wrong agrees with it on its way, but not for so long.
+_Y_ZERO_SAMPLES = 45
 #: Probes that must speak for a channel: one may have met a chip.
 _PROBES = 2
 
 
-def weigh_y(state: JumpState, engines: JumpEngines, grown_um: float, std_um: float) -> None:
+class GrownY(NamedTuple):
+    """Deformation since the zero by measured Y, µm; NaN where it is not known.
+
+    Parameters
+    ----------
+    by_level : float
+        By how Y stood to the prediction before the jump: a model that is wrong by some µm says nothing of the sensor.
+    by_zero : float
+        By Y at the zero: what was wrong before the jump counts, too.
+    """
+
+    by_level: float
+    by_zero: float
+
+
+def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY, std_um: float) -> None:
     """Count the samples for which measured Y has spoken for one engine.
 
     Parameters
@@ -26,14 +44,20 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown_um: float, std_um: flo
         State of the watch, which keeps the counts.
     engines : JumpEngines
         The two engines.
-    grown_um, std_um : float
-        Deformation since the zero by measured Y, NaN if it is not known, and its standard deviation, µm.
+    grown : GrownY
+        Deformation by measured Y.
+    std_um : float
+        Its standard deviation, µm.
     """
-    if math.isnan(grown_um) or not std_um > 0.0:
+    if not std_um > 0.0:
         return
-    speaks = engines.speaks(grown_um, std_um)
-    state.y_for = state.y_for + 1 if speaks > 0 else 0
-    state.y_against = state.y_against + 1 if speaks < 0 else 0
+    if not math.isnan(grown.by_level):
+        speaks = engines.speaks(grown.by_level, std_um)
+        state.y_for = state.y_for + 1 if speaks > 0 else 0
+        state.y_against = state.y_against + 1 if speaks < 0 else 0
+    if not math.isnan(grown.by_zero):
+        state.y_zero_for = state.y_zero_for + 1 if engines.speaks(grown.by_zero, std_um) > 0 else 0
+        state.y_fits = state.y_fits + 1 if engines.fits_y(grown.by_zero, std_um) and not state.y_against else 0
 
 
 def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um: float) -> None:
@@ -47,13 +71,18 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
 
 def confirmed_by(state: JumpState) -> str:
     """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
-    if state.y_for >= _Y_SAMPLES:
+    if state.y_for >= _Y_SAMPLES or state.y_zero_for >= _Y_ZERO_SAMPLES:
         return "measured Y agrees"
     if state.probes_for >= _PROBES:
         return "probes agree"
     if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
         return "the model agrees"
     return ""
+
+
+def is_good_enough(state: JumpState) -> bool:
+    """Return whether measured Y has agreed with the believing engine for long, though perhaps with both."""
+    return state.y_fits >= _Y_ZERO_SAMPLES
 
 
 def is_contradicted(state: JumpState) -> bool:

@@ -74,6 +74,8 @@ class JumpState(msgspec.Struct, kw_only=True):
     ----------
     level_um : float
         Mean of measured Y − prediction over the last samples, or Y at a zero since a jump, µm; of the watch as a whole.
+    zero_um : float
+        Measured Y that stands for no deformation by the zero, µm; of the watch as a whole.
     jumps : dict of str to ChannelJump
         By channel that has jumped. Empty if none has.
     steps : int
@@ -100,6 +102,10 @@ class JumpState(msgspec.Struct, kw_only=True):
         Samples since the first jump, or since what they showed was kept; how many of them had passed at the last jump.
     y_for, y_against : int
         Consecutive samples for which measured Y has spoken for the believing engine, and for the shifted one.
+    y_zero_for : int
+        The same for the believing engine by the change since the zero.
+    y_fits : int
+        Consecutive samples for which that agrees with the believing engine, and perhaps with both.
     probes_for, probes_against : int
         Probes that have spoken for them.
     believing, shifted : Branch, optional
@@ -113,6 +119,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     """
 
     level_um: float = NAN
+    zero_um: float = NAN
     jumps: dict[str, ChannelJump] = {}
     steps: Count = 0
     again: dict[str, Count] = {}
@@ -128,6 +135,8 @@ class JumpState(msgspec.Struct, kw_only=True):
     at_held: Count = 0
     y_for: Count = 0
     y_against: Count = 0
+    y_zero_for: Count = 0
+    y_fits: Count = 0
     probes_for: Count = 0
     probes_against: Count = 0
     believing: Branch | None = None
@@ -191,7 +200,8 @@ class JumpState(msgspec.Struct, kw_only=True):
     def start_evidence(self) -> None:
         """Count the evidence from here on."""
         self.samples, self.ratio = 0, 0.0
-        self.y_for = self.y_against = self.probes_for = self.probes_against = 0
+        self.y_for = self.y_against = self.y_zero_for = self.y_fits = 0
+        self.probes_for = self.probes_against = 0
 
     def suspect(self, phase: Phase = Phase.SUSPECT) -> None:
         """Use the channels no longer that were watched or unconfirmed."""

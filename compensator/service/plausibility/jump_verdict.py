@@ -17,8 +17,8 @@ from compensator.service.plausibility.jump_engines import (
     is_unsteady,
     needed_samples,
 )
-from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_unlikely
-from compensator.service.plausibility.jump_signs import AIR, LEFT, NAMES, RESTED, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_good_enough, is_unlikely
+from compensator.service.plausibility.jump_signs import AIR, FITS, LEFT, NAMES, RESTED, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import JumpState, Phase
 
 #: A jump within the permitted rate is watched for this number of samples.
@@ -82,6 +82,8 @@ def suspected(
         return _accept(engine, engines, state, offered, engines.believing, f"is used again: {by} with it")
     if is_alone and is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
         return _settle(engine, engines, state, offered)
+    if is_alone and is_good_enough(state) and not any(map(math.isnan, offered.values())):
+        return _settle(engine, engines, state, offered, FITS)
     return Verdict()
 
 
@@ -105,13 +107,15 @@ def _keep_what_is_left(
     return Verdict(estimate, notes, used)
 
 
-def _settle(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Verdict:
-    """Use a loose contact that has come to rest: nobody saw how, so it is unconfirmed."""
+def _settle(
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], when: str = RESTED
+) -> Verdict:
+    """Use a channel of which it is not known whether it is right: it is unconfirmed."""
     notes = []
     for name, jump in state.jumps.items():
         expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
         jump.size_k = offered[name] - expected
-        notes.append(unconfirmed_note(name, jump.size_k, RESTED))
+        notes.append(unconfirmed_note(name, jump.size_k, when))
     estimate = engines.give(engine, engines.believing)
     state.phase = Phase.UNCONFIRMED
     state.start_evidence()

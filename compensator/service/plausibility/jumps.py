@@ -19,6 +19,7 @@ from compensator.messages import ChannelSample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
+from compensator.service.plausibility.jump_evidence import GrownY
 from compensator.service.plausibility.jump_signs import JumpSigns
 from compensator.service.plausibility.jump_state import JumpState
 from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
@@ -49,7 +50,7 @@ class JumpWatch:
             y_std_um=stated or model.y_std_um,
         )
         self._jump = OneJump(self._setup)
-        self._level_um = NAN
+        self._level_um = self._zero_um = NAN
         self._learned_um = 0.0
         self._estimate: Estimate | None = None
 
@@ -86,7 +87,9 @@ class JumpWatch:
     @property
     def state(self) -> JumpState:
         """State after the last sample."""
-        return msgspec.structs.replace(self._jump.snapshot(), level_um=self._level_um, learned_um=self._learned_um)
+        return msgspec.structs.replace(
+            self._jump.snapshot(), level_um=self._level_um, zero_um=self._zero_um, learned_um=self._learned_um
+        )
 
     def restore(self, state: JumpState | None) -> None:
         """Continue from a state; None if it is that of a version without this watch.
@@ -98,7 +101,8 @@ class JumpWatch:
         """
         state = state or JumpState()
         self._jump = OneJump.restored(self._setup, state)
-        self._level_um, self._learned_um, self._estimate = state.level_um, state.learned_um, None
+        self._level_um, self._zero_um = state.level_um, state.zero_um
+        self._learned_um, self._estimate = state.learned_um, None
 
     def set_zero(self, used: Estimate | None, y_um: float) -> None:
         """Account for a zero.
@@ -113,7 +117,8 @@ class JumpWatch:
         if used is None:
             self._jump.end()
         self._jump.set_zero(used)
-        self._level_um, self._learned_um = y_um if self._jump.is_open else NAN, 0.0
+        self._level_um = self._zero_um = y_um if self._jump.is_open else NAN
+        self._learned_um = 0.0
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
@@ -163,7 +168,8 @@ class JumpWatch:
         measured = {name: _measured(channels.get(name)) for name in TEMPERATURES}
         fast = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         before = self._before()
-        found = self._jump.judge(engine, measured, fast, others, y_um - self._level_um)
+        grown = GrownY(by_level=y_um - self._level_um, by_zero=y_um - self._zero_um)
+        found = self._jump.judge(engine, measured, fast, others, grown)
         self._forget(*before)
         return found
 
@@ -188,12 +194,21 @@ class JumpWatch:
         self._jump.receive_probe(grown_um, math.hypot(std_um, self._setup.y_std_um))
         self._learned_um += learned_um
 
-    def observe(self, y_um: float, estimate: Estimate) -> None:
-        """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
+    def observe(self, y_um: float, zero_um: float, estimate: Estimate) -> None:
+        """Count quiet samples, and follow what measured Y is compared with after a later jump.
+
+        Parameters
+        ----------
+        y_um, zero_um : float
+            Measured Y, and what it is without deformation by the zero, µm; NaN if it is not known.
+        estimate : Estimate
+            That of the compensation's engine.
+        """
         self._estimate = estimate
         if not self.is_on or self._jump.is_open:
             return
         self._jump.state.count_quiet()
+        self._zero_um = zero_um
         if math.isnan(y_um):
             return
         residual = y_um - estimate.y_um

@@ -24,7 +24,7 @@ from compensator.service.plausibility.jump_engines import (
     shifts_against,
     stds,
 )
-from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
+from compensator.service.plausibility.jump_evidence import GrownY, is_contradicted, weigh_probe, weigh_y
 from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import JumpState, Phase
 from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
@@ -270,7 +270,7 @@ class OneJump:
         measured: Mapping[str, float],
         fast: list[str],
         others: Mapping[str, float],
-        grown_um: float,
+        grown_y: GrownY,
     ) -> Judgement:
         """Judge a sample before the step of the engine that it is for.
 
@@ -284,8 +284,8 @@ class OneJump:
             Channels that have moved beyond their permitted rate.
         others : mapping of str to float
             Usable values of the auxiliary channels.
-        grown_um : float
-            Deformation since the zero by measured Y, µm; NaN if it is not known.
+        grown_y : GrownY
+            Deformation since the zero by measured Y.
         """
         before, was_unconfirmed, was_new = self.zero_in_use, self.state.is_unconfirmed, self._engines is None
         if self._engines is not None:
@@ -308,12 +308,12 @@ class OneJump:
         new = [name for name in fed.jumped if was_new or name in seen_again]
         notes += self._entered(engine, engines, offered, fed, [name for name in jumped if name in fed.jumped], new)
         engines.weigh(self.state, offered, fed)
-        beside = self._judge_beside(engines, measured, fast, fed, others, grown_um, unseen)
+        beside = self._judge_beside(engines, measured, fast, fed, others, grown_y, unseen)
         offered |= dict.fromkeys(self._beside_suspects, NAN)
         engines.step(offered, fed.values | dict.fromkeys(self._beside_suspects, NAN), others, beside.estimate)
         self.state.samples += 1
         self.state.age += 1
-        weigh_y(self.state, engines, grown_um, self._setup.y_std_um)
+        weigh_y(self.state, engines, grown_y, self._setup.y_std_um)
         estimate: Estimate | None = None
         if beside.gives:
             # What the other channel has shown is undone in the engine that goes on without this one, too.
@@ -458,7 +458,7 @@ class OneJump:
         fast: list[str],
         fed: Fed,
         others: Mapping[str, float],
-        grown_um: float,
+        grown_y: GrownY,
         unseen: Mapping[str, int],
     ) -> Judgement:
         """Judge the other channel; `unseen` counts the samples without each channel before this one."""
@@ -479,7 +479,7 @@ class OneJump:
         if names == ["t_q_degc"] and not fast and not self._beside.is_open and self._is_expected(engines, measured):
             self._beside._seen_again(values)
             return Judgement()
-        found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_um)
+        found = self._beside.judge(engines.shifted.engine, values, fast, others, grown_y)
         if not self._beside.is_open:
             self._beside.state.count_quiet()
         return found

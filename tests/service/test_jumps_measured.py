@@ -1,0 +1,79 @@
+"""A channel that has jumped, with measured Y: what was wrong before the jump, and what is too small to decide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.state import decode_state
+from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
+from tests.service.records import QUILL, sample
+
+
+@pytest.fixture(scope="module")
+def day() -> dict[str, np.ndarray]:
+    return working_day()
+
+
+def sticks(begin: int, end: int) -> Change:
+    """T_Q keeps its value."""
+    kept: list[float] = []
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if begin <= i < end:
+            kept.append(values["t_q_degc"])
+            values["t_q_degc"] = kept[0]
+
+    return change
+
+
+@pytest.mark.parametrize(("begin", "end"), [(300, 360), (400, 450)])
+def test_measured_y_speaks_for_a_mended_channel_though_it_was_wrong_before_it_jumped(
+    day: dict[str, np.ndarray], begin: int, end: int
+) -> None:
+    """The mend is the jump: against the level of Y before it the mended channel is the wrong one."""
+    outcomes = run(day, sticks(begin, end), y=True)
+    assert "suspect_channel:t_q_degc" in outcomes[end + 2].offset.reasons
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    assert not wrong[end + 90 :].any()
+    assert outcomes[end + 180].offset.state == "ok"
+
+
+def followed(day: dict[str, np.ndarray], change: Change, *, restart: int | None = None) -> list[Outcome]:
+    """Run with a Y whose deviation hides a small jump; perhaps with a restart."""
+    conf = settings({"residual_std_um": 2.3})
+    compensation, outcomes = Compensation(conf, QUILL), []
+    for i in range(len(day["t_s"])):
+        if i == restart:
+            state = compensation.state()
+            assert decode_state(state).jumps.y_fits > 0  # type: ignore[union-attr]
+            compensation = Compensation(conf, QUILL)
+            compensation.restore(state)
+        values = readings(day, i)
+        change(i, values)
+        outcomes.append(compensation.process(sample(i, values)))
+    return outcomes
+
+
+@pytest.mark.parametrize(("size", "left"), [(8.0, 1.2), (6.0, 1.1)])
+def test_the_offset_is_not_held_for_a_jump_that_is_too_small_for_measured_y_to_tell(
+    day: dict[str, np.ndarray], size: float, left: float
+) -> None:
+    change = steps((300, "t_q_degc", size), (360, "t_q_degc", left))
+    outcomes = followed(day, change)
+    assert "unconfirmed_channel:t_q_degc" in outcomes[420].offset.reasons
+    assert sum(o.offset.state == "hold" for o in outcomes[360:]) < 150
+    again = followed(day, change, restart=390)
+    assert [o.offset for o in again] == [o.offset for o in outcomes]
+
+
+def test_beside_a_model_that_was_wrong_before_a_jump_it_is_not_believed_by_chance(day: dict[str, np.ndarray]) -> None:
+    """Y goes on to agree with the channel less its jump, by the level before: that it once comes by is no evidence."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["y_um"] += 12.0 * min(max(i - 120, 0) / 120.0, 1.0)
+        values["t_q_degc"] += 4.0 if i >= 300 else 0.0
+
+    outcomes = run(day, change, y=True)
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[301:420])
