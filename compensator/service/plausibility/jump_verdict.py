@@ -147,7 +147,8 @@ def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Map
         As `suspected` has them.
     """
     is_refuted, only_at = is_unlikely(state), state.is_at_alone
-    is_back = state.is_back(1)
+    # What is used may be where it was for a moment because heat is switched; a jump that is watched is over at once.
+    is_back = state.is_back(needed_samples(state) if state.phase == Phase.UNCONFIRMED else 1)
     if only_at and is_refuted and not is_back and not state.is_unconfirmed:
         state.phase = Phase.AIR
         return Verdict(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
