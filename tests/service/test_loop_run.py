@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -142,6 +142,25 @@ def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -
     assert any(later == 0.0 < before for before, later in itertools.pairwise(hours)), "nothing was forgotten"
     adopted = next(seq for seq, step, _ in decisions(steps) if step == "adopt")
     assert adopted >= ends + 12 * 60 and loop.effects == ("input:coolant_degc",)
+
+
+def adopted_at(loses: Callable[[int], bool]) -> int:
+    """Run two days with an effect, in which T_Q is missing in some samples; return when a model is adopted."""
+
+    def losing(i: int, values: dict[str, float]) -> None:
+        if loses(i):
+            values["t_q_degc"] = math.nan
+
+    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    return next(seq for seq, step, _ in decisions(run(loop, machine(2 * DAY, change=losing))) if step == "adopt")
+
+
+def test_what_a_line_loses_now_and_then_keeps_nothing_from_being_decided() -> None:
+    """One sample in twenty, so there is no half an hour without a loss; a couple that was broken delays a decision."""
+    whole = adopted_at(lambda i: False)
+    assert whole <= adopted_at(lambda i: i % 20 == 0) <= whole + 60
+    broken = range(whole - 61, whole - 1)
+    assert broken.stop + 30 <= adopted_at(lambda i: i in broken) <= broken.stop + 180
 
 
 def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_fault_of_a_sensor() -> None:

@@ -113,7 +113,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     planned_utc_ns, diagnosed_utc_ns : int
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min, clean_min : float
-        For how long the model, and for how long no sensor, has been suspected, min.
+        For how long the model has been suspected, and no sensor, as far as that is counted, min.
     found : list of Place
         What diagnoses have found: candidates, and the calibrated model.
     watched : Place, optional

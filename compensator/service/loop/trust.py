@@ -18,19 +18,22 @@ from compensator.service.outcome import Outcome
 from compensator.service.transfer.second_opinion import sensor_suspected
 
 _CONTRADICTED = (Reason.T_Q_AT_EXCHANGED, Reason.T_Q_AT_APART)
-_DISTURBED = (
-    Reason.T_Q_MISSING,
-    Reason.AT_MISSING,
-    Reason.OPERATOR_HOLD,
-    Reason.INTERNAL_ERROR,
-    *_CONTRADICTED,
-)
+_LOST = (Reason.T_Q_MISSING, Reason.AT_MISSING)
+_FAULTS = (Reason.OPERATOR_HOLD, Reason.INTERNAL_ERROR, *_CONTRADICTED)
+_DISTURBED = (*_LOST, *_FAULTS)
 _ALARMS = (Reason.IMPLAUSIBLE, Reason.RESIDUAL_TOO_LARGE)
 
 
 def is_disturbed(reasons: Sequence[str]) -> bool:
     """Return whether a sample with these reasons shows a fault by itself."""
     return any(reason.startswith(_DISTURBED) for reason in reasons)
+
+
+def is_lost(reasons: Sequence[str]) -> bool:
+    """Return whether a sample lacks a temperature, and no channel is suspected: a line loses a reading now and then."""
+    return any(reason in _LOST for reason in reasons) and not any(
+        reason.startswith(Reason.SUSPECT_CHANNEL) or reason in _FAULTS for reason in reasons
+    )
 
 
 def is_contradicted(reasons: Sequence[str]) -> bool:
