@@ -22,8 +22,8 @@ from compensator.recording.naming import order_of
 from compensator.recording.reading import has_begun, last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
 
-#: Number of files whose ends are kept: the live one, and earlier ones whose recovery a kill has interrupted.
-KEPT = 4
+#: Number of files whose ends are kept: the live one, and earlier ones whose recovery kills have interrupted.
+KEPT = 8
 #: Longest file that is read, bytes.
 LONGEST = 2**20
 
@@ -123,7 +123,7 @@ class HeadKeeper:
             If it cannot be written; the old file is kept.
         """
         end = End(file=file, synced=synced.hex(), pending=[value.hex() for value in pending])
-        ends = _kept([one for one in self.ends if one.file != file], end)
+        ends = (*(one for one in self.ends if one.file != file), end)[-KEPT:]
         head = Head(
             chain_head=1,
             machine=self._machine,
@@ -136,12 +136,9 @@ class HeadKeeper:
         self.ends = ends
         replace_file(self.path, msgspec.json.encode(head), mode=0o640)
 
-
-def _kept(before: list[End], end: End) -> tuple[End, ...]:
-    """Return the ends that are kept: files that never came to disk, as on a full one, go first."""
-    while len(before) >= KEPT:
-        before.remove(next((one for one in before if not one.synced), before[0]))
-    return (*before, end)
+    def forget(self, file: str) -> None:
+        """Forget a file that never came to disk, as on a full one: many of them must not displace what a kill left."""
+        self.ends = tuple(one for one in self.ends if one.file != file)
 
 
 def read_head(path: Path, verifier: Verifier | None = None) -> Head:

@@ -199,7 +199,11 @@ class McapRecorder:
         self._reason = "failure"
         # Read from the file when the next one opens: only the file shows what it contains.
         self._last = b""
-        if live is not None and not live.give_up():
+        if live is None:
+            return
+        if self._keeper is not None and not live.synced:
+            self._keeper.forget(live.path.name)
+        if not live.give_up():
             self._uncut = live.path, live.synced
 
     def _open(self, time_utc_ns: int, day: str, opening: Mapping[str, bytes]) -> None:

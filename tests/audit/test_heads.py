@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,10 +18,11 @@ from compensator.audit.series import Audit, audit, combine, summary
 from compensator.codes import RecordingEnd
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
+from compensator.recording import live_file
 from compensator.recording.chain import NOTHING
 from compensator.recording.container import Container, Damaged
 from compensator.recording.finishing import Finisher, Retention, compact
-from compensator.recording.head import KEPT, LONGEST, HeadKeeper, read_head
+from compensator.recording.head import KEPT, LONGEST, read_head
 from compensator.recording.numbering import first_sequence
 from compensator.recording.reading import (
     GROUP_BYTES,
@@ -460,15 +462,36 @@ def test_an_empty_file_beside_a_running_service_is_not_the_one_before_its_next(s
     assert shop.audit(head=True).clean, summary(shop.audit(head=True))
 
 
-def test_a_full_disk_that_opens_no_file_forgets_no_end(shop: Shop) -> None:
+def test_a_full_disk_that_opens_no_file_forgets_no_end(shop: Shop, monkeypatch: pytest.MonkeyPatch) -> None:
     """The head keeps the end of the file that was broken off, however often a new one cannot be begun."""
     shop.start().run(20).kill()
-    keeper = HeadKeeper(shop.head, MACHINE, shop.signer)
-    known = keeper.ends
-    for i in range(9):
-        keeper.expect(f"{MACHINE}_20260106T0{i}0000Z.mcap", b"", [b"x"], 0)
-    assert all(end in keeper.ends for end in known) and len(keeper.ends) <= KEPT
-    assert keeper.ends[-1].file.endswith("T080000Z.mcap")
+    service = shop.start(20)
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(live_file.os, "write", full)
+        for _ in range(KEPT + 1):
+            with pytest.raises(OSError, match="No space"):
+                service.recorder.write([], service.now_ns)
+    service.run(5).stop()
+    assert shop.audit(head=True).clean, summary(shop.audit(head=True))
+
+
+def test_kills_right_after_the_start_of_a_file_leave_ends_that_are_signed(
+    shop: Shop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a computer so busy that a file before is finished only by the fifth start."""
+    with monkeypatch.context() as busy:
+        busy.setattr(Finisher, "enqueue", lambda *_: None)
+        for i in range(5):
+            service = shop.start(i)
+            service.recorder.write([], service.now_ns)
+            service.kill()
+    shop.start(5).run(5).stop()
+    found = shop.audit(head=True)
+    assert found.clean and [file.end for file in found.files] == ["recovered"] * 5 + ["finished"], summary(found)
 
 
 def test_a_file_without_a_record_is_none_of_those_that_retention_keeps(shop: Shop) -> None:
