@@ -1,19 +1,23 @@
 """One time for the loops of several threads: it stands still while any of them works, and jumps when all wait.
 
-A time-out then expires because no answer comes, never because the computer is busy; and nobody waits for it.
+A time-out then expires because no answer comes, never because computer or disk are busy; and nobody waits for it.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 import selectors
 import threading
 import time
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
+from unittest import mock
 
+from compensator.service import disk_writer
 from sim_hardware.wire import Rack
 
 #: All loops have waited so long in real time before the time jumps: what is under way on loopback arrives first.
@@ -47,8 +51,11 @@ class SharedTime:
         return _Loop(self)
 
     def run(self, coroutine: Coroutine[Any, Any, _Result]) -> _Result:
-        """Run a coroutine in a loop of its own that has this time."""
-        with asyncio.Runner(loop_factory=self.new_loop) as runner:
+        """Run a coroutine in a loop of its own that has this time; while a service in it writes to disk, it works."""
+        with (
+            mock.patch.object(disk_writer, "ThreadPoolExecutor", functools.partial(_Executor, self)),
+            asyncio.Runner(loop_factory=self.new_loop) as runner,
+        ):
             return runner.run(coroutine)
 
     def read_s(self) -> float:
@@ -63,9 +70,13 @@ class SharedTime:
             self._waits[loop] = None
 
     def leave(self, loop: object) -> None:
-        """Let a loop take part no longer."""
+        """Let a loop take part no longer; the others may be woken by what it has done, so their quiet counts anew."""
         with self._changed:
             self._waits.pop(loop, None)
+            now_s = time.monotonic()
+            for other, wait in self._waits.items():
+                if wait is not None:
+                    self._waits[other] = wait[0], now_s, wait[2]
 
     @contextlib.contextmanager
     def waiting(self, loop: object, until_s: float = math.inf, looked_s: float = -math.inf) -> Iterator[None]:
@@ -133,6 +144,21 @@ class _Loop(asyncio.SelectorEventLoop):
     def close(self) -> None:
         self._shared.leave(self.waits)
         super().close()
+
+
+class _Executor(ThreadPoolExecutor):
+    """Threads whose work is work for the shared time, too, from the moment in which it is handed over."""
+
+    def __init__(self, shared: SharedTime, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self._shared = shared
+
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **settings: Any) -> Future[Any]:
+        job = object()
+        self._shared.enter(job)
+        future = super().submit(work, *arguments, **settings)
+        future.add_done_callback(lambda _: self._shared.leave(job))
+        return future
 
 
 class TimedRack(Rack):

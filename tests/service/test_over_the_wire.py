@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from compensator.clock import VirtualClock
 from compensator.messages import number
 from compensator.model.model_file import load_model
 from compensator.recording.recorder import McapRecorder
+from compensator.service import disk_writer
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import CapaNcdt, IcpDas, ModbusRtuLine, ModbusTcpServer, Rack
-from tests.service.shared_time import SharedTime, TimedRack
+from tests.service.shared_time import QUIET_S, SharedTime, TimedRack
 from tests.service.simulated import START_NS, TABLE, config
 
 CHANNELS = [
@@ -177,3 +179,17 @@ def test_a_fault_is_missing_never_a_number_and_heals(
 
     with TimedRack(shared) as rack:
         shared.run(run())
+
+
+def test_the_shared_time_stands_still_while_something_is_written_to_disk() -> None:
+    """A slow disk makes no device late: the disk takes far longer than the loop waits before the time jumps."""
+    shared = SharedTime()
+
+    async def run() -> None:
+        executor = disk_writer.ThreadPoolExecutor(1)
+        async with asyncio.timeout(5.0):
+            await asyncio.wrap_future(executor.submit(time.sleep, 20 * QUIET_S))
+        executor.shutdown()
+
+    shared.run(run())
+    assert shared.now_s < 1.0
