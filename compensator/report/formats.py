@@ -32,7 +32,7 @@ BROWSERS = (
     "brave-browser",
 )
 #: Longest time that a browser may take, s.
-TIMEOUT_S = 60.0
+TIMEOUT_S = 180.0
 #: First bytes of what is printed.
 _SIGNATURES = {".pdf": b"%PDF-", ".png": b"\x89PNG\r\n"}
 #: What says that a page is ours, whatever its version, within its first bytes.

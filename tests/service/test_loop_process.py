@@ -98,9 +98,10 @@ async def test_one_that_hangs_is_ended_with_everything_that_it_has_started(tmp_p
         time.sleep(600)
     """
     began = time.monotonic()
-    found = await made(tmp_path, script, time_limit_min=0.03)
+    # A process of the lowest priority needs seconds to begin on a busy computer.
+    found = await made(tmp_path, script, time_limit_min=0.2)
     assert found.verdict == "failed" and "loop.time_limit_min" in found.needs
-    assert time.monotonic() - began < 30.0
+    assert time.monotonic() - began < 120.0
     for pid in map(int, (tmp_path / "diagnoses" / "pids").read_text(encoding="utf-8").split()):
         assert await gone(pid)
 
