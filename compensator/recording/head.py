@@ -22,8 +22,8 @@ from compensator.recording.naming import order_of
 from compensator.recording.reading import has_begun, last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
 
-#: Number of files whose ends are kept: the live one, and earlier ones whose recovery kills have interrupted.
-KEPT = 8
+#: Number of files whose ends are kept: the live one, and eight before whose recovery kills have interrupted.
+KEPT = 9
 #: Longest file that is read, bytes.
 LONGEST = 2**20
 

@@ -201,10 +201,10 @@ class McapRecorder:
         self._last = b""
         if live is None:
             return
-        if self._keeper is not None and not live.synced:
-            self._keeper.forget(live.path.name)
         if not live.give_up():
             self._uncut = live.path, live.synced
+        elif self._keeper is not None and not live.synced:
+            self._keeper.forget(live.path.name)
 
     def _open(self, time_utc_ns: int, day: str, opening: Mapping[str, bytes]) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)

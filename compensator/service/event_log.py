@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from compensator.clock import Clock
+from compensator.errors import one_line
 from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, encode
-from compensator.receiver.reasons import printable
 
 #: Largest number of events that are kept for the recording; beyond that the oldest are dropped.
 WAITING_EVENTS = 1000
@@ -35,7 +35,7 @@ class EventLog:
             seq=self.sequence,
             time_utc_ns=self._clock.utc_ns(),
             kind=kind,
-            text=printable(text, LONGEST_TEXT),
+            text=one_line(text)[:LONGEST_TEXT],
             data=dict(data or {}),
         )
         # Bounded, so that memory does not grow if nothing can be recorded.

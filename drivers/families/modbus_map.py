@@ -171,8 +171,13 @@ def _bad_values(given: MapInput, where: Where) -> dict[float, Quality]:
             raise where.wrong(f"bad_values.{key}", value, one_of(_BAD))
         for number in numbers if isinstance(numbers, list) else [numbers]:
             try:
-                raw: Any = int(number, 0) if isinstance(number, str) else number
-                found[as_decoded(float(raw), given.type)] = _BAD[quality]
+                # The bits of a float32 are no number: they would never be found.
+                text = float if given.type == "float32" else lambda digits: int(digits, 0)
+                raw: Any = text(number) if isinstance(number, str) else number
+                decoded = as_decoded(float(raw), given.type)
+                if not math.isfinite(decoded):
+                    raise ValueError
+                found[decoded] = _BAD[quality]
             except (TypeError, ValueError, OverflowError):
                 expected = f"a number as in the registers, which {given.type} can hold"
                 raise where.wrong(f"bad_values.{key}", number, expected) from None

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from sim_hardware.wire.faults import Faults
 
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 
 _Result = TypeVar("_Result")
 

@@ -15,6 +15,7 @@ from mcap.writer import Writer
 
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit, audit, combine, summary
+from compensator.clock import NS
 from compensator.codes import RecordingEnd
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
@@ -472,9 +473,9 @@ def test_a_full_disk_that_opens_no_file_forgets_no_end(shop: Shop, monkeypatch: 
 
     with monkeypatch.context() as disk:
         disk.setattr(live_file.os, "write", full)
-        for _ in range(KEPT + 1):
+        for i in range(KEPT + 1):
             with pytest.raises(OSError, match="No space"):
-                service.recorder.write([], service.now_ns)
+                service.recorder.write([], service.now_ns + i * NS)
     service.run(5).stop()
     assert shop.audit(head=True).clean, summary(shop.audit(head=True))
 
@@ -482,16 +483,17 @@ def test_a_full_disk_that_opens_no_file_forgets_no_end(shop: Shop, monkeypatch: 
 def test_kills_right_after_the_start_of_a_file_leave_ends_that_are_signed(
     shop: Shop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on a computer so busy that a file before is finished only by the fifth start."""
+    """As on a computer so busy that a file before is finished only by the ninth start."""
     with monkeypatch.context() as busy:
         busy.setattr(Finisher, "enqueue", lambda *_: None)
-        for i in range(5):
+        for i in range(KEPT - 1):
             service = shop.start(i)
             service.recorder.write([], service.now_ns)
             service.kill()
-    shop.start(5).run(5).stop()
+    shop.start(KEPT).run(5).stop()
     found = shop.audit(head=True)
-    assert found.clean and [file.end for file in found.files] == ["recovered"] * 5 + ["finished"], summary(found)
+    assert found.clean, summary(found)
+    assert [file.end for file in found.files] == ["recovered"] * (KEPT - 1) + ["finished"]
 
 
 def test_a_file_without_a_record_is_none_of_those_that_retention_keeps(shop: Shop) -> None:

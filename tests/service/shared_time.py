@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import functools
 import math
+import os
 import selectors
 import threading
 import time
@@ -20,12 +21,18 @@ from unittest import mock
 from compensator.service import disk_writer
 from sim_hardware.wire import Rack
 
-#: All loops have waited so long in real time before the time jumps: what is under way on loopback arrives first.
+#: All loops have waited so long in real time before the time jumps: what is under way on loopback arrives first. Where
+#: programs wait for a processor it takes longer (`quiet_s`).
 QUIET_S = 0.01
 #: What reading the time takes: who asks again and again whether a time has come sees it come.
 READING_S = 1e-6
 
 _Result = TypeVar("_Result")
+
+
+def quiet_s() -> float:
+    """Return how long a message on loopback may be under way on a computer as busy as this one, s."""
+    return QUIET_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1) - 1.0)
 
 
 class SharedTime:
@@ -99,8 +106,8 @@ class SharedTime:
             next_s = min(until_s for until_s, _, _ in waits)
             if len(waits) < len(self._waits) or next_s <= self.now_s or math.isinf(next_s):
                 return
-            quiet_s = min(looked for _, _, looked in waits) - max(since_s for _, since_s, _ in waits)
-            if quiet_s >= min(QUIET_S, next_s - self.now_s):
+            waited_s = min(looked for _, _, looked in waits) - max(since_s for _, since_s, _ in waits)
+            if waited_s >= min(quiet_s(), next_s - self.now_s):
                 self.now_s = next_s
 
 
@@ -154,11 +161,24 @@ class _Executor(ThreadPoolExecutor):
         self._shared = shared
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **settings: Any) -> Future[Any]:
-        job = object()
+        """Hand work over; who waits for it is woken before the shared time goes on."""
+        job, shown = object(), Future[Any]()
+
+        def done(inner: Future[Any]) -> None:
+            error = inner.exception()
+            if error is not None:
+                shown.set_exception(error)
+            else:
+                shown.set_result(inner.result())
+            self._shared.leave(job)
+
         self._shared.enter(job)
-        future = super().submit(work, *arguments, **settings)
-        future.add_done_callback(lambda _: self._shared.leave(job))
-        return future
+        try:
+            super().submit(work, *arguments, **settings).add_done_callback(done)
+        except RuntimeError:
+            self._shared.leave(job)
+            raise
+        return shown
 
 
 class TimedRack(Rack):

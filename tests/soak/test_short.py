@@ -14,7 +14,8 @@ from tests.soak import kills, month
 def test_killed_again_and_again(tmp_path: Path) -> None:
     result = kills.run(tmp_path, 5, seed=5, longest_s=0.5, period_s=0.25)
     assert sum(result.kills.values()) == 5 and result.kills["adopting"] == 1
-    assert result.offsets >= 5 and result.recorded >= result.offsets
+    # What a slow disk had not taken when it was published may be lost by a kill, as its reason says.
+    assert result.offsets >= 5 and result.recorded >= result.offsets - result.early_lost
 
 
 @pytest.mark.timeout(300)

@@ -33,7 +33,7 @@ from compensator.service.loop.place import (
     with_effects,
 )
 from compensator.service.loop.proof import is_limited
-from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
+from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
 from compensator.service.loop.trust import all_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed, is_lost
@@ -111,9 +111,10 @@ class Loop:
         """
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
         minutes, suspected = self._period_s / 60.0, is_contradicted(reasons)
+        forget_future(state, now_ns)
         if others:
             suspected = suspected or all_suspect_a_sensor([present, *others.values()])
-        self._count_clean(present, minutes, suspected=suspected)
+        state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
         state.misfit_min = state.misfit_min + minutes if is_alarmed(reasons) else 0.0
         state.error.update(present)
         notes: list[Note] = []
@@ -131,20 +132,6 @@ class Loop:
         if judged and not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
             notes += self._choose(judged, now_ns)
         return notes + self._schedule(now_ns)
-
-    def _count_clean(self, present: Outcome, minutes: float, *, suspected: bool) -> None:
-        """Count the time without a suspicion up to `CLEAN_MIN`.
-
-        A lost sample takes back what a good one gives: where a line loses one reading in twenty, there are hardly ever
-        thirty minutes without a loss, while a couple that is broken for so long leaves nothing.
-        """
-        reasons, before_min = present.offset.reasons, min(self.state.clean_min, CLEAN_MIN)
-        if not suspected and is_lost(reasons):
-            self.state.clean_min = max(before_min - minutes, 0.0)
-        elif suspected or is_disturbed(reasons) or is_unusable(present):
-            self.state.clean_min = 0.0
-        else:
-            self.state.clean_min = min(before_min + minutes, CLEAN_MIN)
 
     # ------------------------------------------------------------------ decisions about a shadow
 
@@ -343,3 +330,17 @@ class Loop:
 
 def _named(place: Place) -> str:
     return f"{place.sha256[:12]} with {named(place.effects)}"
+
+
+def _counted(before_min: float, present: Outcome, minutes: float, *, suspected: bool) -> float:
+    """Return the time without a suspicion up to `CLEAN_MIN`, min.
+
+    A lost sample takes back what a good one gives: where a line loses one reading in twenty, there are hardly ever
+    thirty minutes without a loss, while a couple that is broken for so long leaves nothing.
+    """
+    reasons, before_min = present.offset.reasons, min(before_min, CLEAN_MIN)
+    if not suspected and is_lost(reasons):
+        return max(before_min - minutes, 0.0)
+    if suspected or is_disturbed(reasons) or is_unusable(present):
+        return 0.0
+    return min(before_min + minutes, CLEAN_MIN)

@@ -11,11 +11,20 @@ from compensator.service.loop.state import LoopState, Running
 _HOUR_NS = 3600 * NS
 
 
+def forget_future(state: LoopState, now_ns: int) -> None:
+    """Let nothing have happened after now: the clock was ahead, and was set back."""
+    state.diagnosed_utc_ns = min(state.diagnosed_utc_ns, now_ns)
+    state.adopted_utc_ns = min(state.adopted_utc_ns, now_ns)
+    for place in state.taken:
+        place.since_utc_ns = min(place.since_utc_ns, now_ns)
+
+
 def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
     """Return the last planned time, ns since 1970 UTC; at the first sample it counts as done."""
     at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
     planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
-    state.planned_utc_ns = state.planned_utc_ns or planned_ns
+    # One after the last planned time was made while the clock was ahead.
+    state.planned_utc_ns = min(state.planned_utc_ns or planned_ns, planned_ns)
     return planned_ns
 
 

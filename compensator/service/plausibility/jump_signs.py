@@ -17,7 +17,11 @@ _JUMP = 6.0
 
 #: Since when, and why, a channel is unconfirmed.
 UNSEEN, RESTED, AIR = "after samples without it", "now that it is at rest", "and T_Q does not follow"
-BESIDE, LEFT, FITS = "while another channel is in question", "after most of its jump is gone", "and measured Y agrees"
+BESIDE, LEFT, FITS = (
+    "while another channel is in question",
+    "after most of its jump is gone",
+    "too little for measured Y to tell",
+)
 
 NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
 

@@ -183,6 +183,14 @@ DEVICE_MISTAKES = [
         device("modbus-map", "bus", [{**RPM, "type": "uint16", "bad_values": {"70000": "stale"}}]),
         "expected a number as in the registers, which uint16 can hold",
     ),
+    (
+        device("modbus-map", "bus", [{**RPM, "type": "float32", "bad_values": {"0xC479F99A": "stale"}}]),
+        "expected a number as in the registers, which float32 can hold",
+    ),
+    (
+        device("modbus-map", "bus", [{**RPM, "type": "float32", "bad_values": {"nan": "stale"}}]),
+        "expected a number as in the registers, which float32 can hold",
+    ),
     (device("modbus-map", "bus", [{**RPM, "function": 1}]), "key 'function' is 1"),
     (device("capancdt-6200", "cap", [{"input": 0, "couple": "K"}]), "inputs[0]: key 'couple' is not known"),
     (device("capancdt-6200", "cap", [{"input": 0}], address=1), "key 'address' is not known"),

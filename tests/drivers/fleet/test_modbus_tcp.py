@@ -194,6 +194,7 @@ async def test_modbus_map(rig: Any, slave: Any) -> None:
         ("float32", [0x454C, 0xCB33], 3276.7),
         ("int16", [0x8000], "0x8000"),
         ("int16", [0x8000], -32768),
+        ("float32", [0xC479, 0xF99A], "-999.9"),
         ("uint16", [0xFFFF], -1),
         ("int32", [0x8000, 0x0000], 0x80000000),
     ],
