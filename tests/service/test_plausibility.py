@@ -20,11 +20,12 @@ from compensator.service.plausibility import BLOCK_SAMPLES, PlausibilityCheck, P
 from compensator.service.state import decode_state
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.service.records import QUILL, sample
-from tests.service.shared_time import SharedTime, TimedRack
 from tests.service.simulated import TABLE, config
-from tests.service.wired import Receiver, WiredMachine
+from tests.service.wired import WiredMachine, workshop
 
 LIMITS = {"t_q_below_at_after_min": 15.0, "false_alarm_days": 365.0, "residual_std_um": 0.3}
+#: No device is silent here: a longer time-out keeps a busy computer from looking like one that is.
+WIRED: dict[str, Any] = {"plausibility": LIMITS, "timeout_s": 1.0}
 CHANNELS = [*TABLE["channel"][:3], {"name": "heat_w", "device": "module", "input": 4}]
 Change = Callable[[int, dict[str, float]], None]
 
@@ -388,47 +389,30 @@ def wired_world() -> World:
     return World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
 
 
-def wired(
-    folder: Path,
-    world: World,
-    samples: int,
-    *,
-    prepare: Callable[[WiredMachine], None] = lambda machine: None,
-    **settings: Any,
-) -> WiredMachine:
-    """Run the whole service on simulated devices, whose time-outs do not expire because the computer is busy."""
-    shared = SharedTime()
-
-    async def run() -> WiredMachine:
-        machine = WiredMachine(rack, folder, world, receiver=receiver, plausibility=LIMITS, **settings)
-        prepare(machine)
-        await machine.run(samples)
-        return machine
-
-    with TimedRack(shared) as rack, Receiver() as receiver:
-        return shared.run(run())
-
-
-def test_wires_exchanged_at_the_start_over_the_wire(tmp_path: Path) -> None:
+async def test_wires_exchanged_at_the_start_over_the_wire(tmp_path: Path) -> None:
     world = wired_world()
     swapped = {"t_q_degc": world.source("at_degc"), "at_degc": world.source("t_q_degc")}
-    machine = wired(tmp_path, world, 120, sources=swapped, layout="one line")
+    with workshop() as (rack, receiver):
+        machine = WiredMachine(rack, tmp_path, world, receiver=receiver, sources=swapped, layout="one line", **WIRED)
+        await machine.run(120)
     raised = next(o for o in machine.offsets if "t_q_at_exchanged" in o.reasons)
     assert raised.state == "fault" and machine.offsets[-1].state == "fault"
     assert machine.offsets[-1].y_offset_um == raised.y_offset_um is not None
     assert "suspects: T_Q, AT" in " ".join(event.text for event in machine.events("plausibility"))
 
 
-def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) -> None:
-    def prepare(machine: WiredMachine) -> None:
+async def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) -> None:
+    world = wired_world()
+    with workshop() as (rack, receiver):
+        machine = WiredMachine(rack, tmp_path, world, receiver=receiver, **WIRED)
+
         def exchange(outcome: Outcome) -> None:
             if len(machine.outcomes) == 150:
                 sources = machine.sources
                 sources["t_q_degc"], sources["at_degc"] = sources["at_degc"], sources["t_q_degc"]
 
         machine.after = exchange
-
-    machine = wired(tmp_path, wired_world(), 260, prepare=prepare)
+        await machine.run(260)
     after = machine.offsets[150:]
     assert after[0].state == "degraded"  # neither is used from the first sample on
     assert {o.state for o in after[40:]} == {"fault"}
@@ -439,12 +423,14 @@ def test_wires_exchanged_on_a_hot_machine_over_the_wire(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("channel", "per_h", "within_min"), [("t_q_degc", 0.5, 100), ("t_q_degc", 1.0, 70), ("at_degc", 2.0, 60)]
 )
-def test_a_drift_over_the_wire(tmp_path: Path, channel: str, per_h: float, within_min: int) -> None:
+async def test_a_drift_over_the_wire(tmp_path: Path, channel: str, per_h: float, within_min: int) -> None:
     world = wired_world()
     straight = world.source(channel)
     begin_s = 120 * 60.0
     drifting = {channel: lambda: straight() + per_h * max(world.t_s - begin_s, 0.0) / 3600.0}
-    machine = wired(tmp_path, world, 120 + within_min, sources=drifting)
+    with workshop() as (rack, receiver):
+        machine = WiredMachine(rack, tmp_path, world, receiver=receiver, sources=drifting, **WIRED)
+        await machine.run(120 + within_min)
     raised = next(i for i, o in enumerate(machine.offsets) if any(r.startswith("implausible") for r in o.reasons))
     assert raised >= 120
     assert f"implausible:{channel}" in machine.offsets[raised].reasons
