@@ -11,7 +11,7 @@ import sys
 import warnings
 import zlib
 
-#: What scipy raises for a damaged file, besides its own error.
+#: What scipy raises for a damaged file besides its own error, and pandas for a damaged workbook.
 DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 
 

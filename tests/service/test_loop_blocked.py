@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,28 +16,23 @@ from tests.service.simulated import START_NS
 YEAR_NS = 365 * 86_400 * NS
 
 
-def outcome(time_utc_ns: int, reasons: Sequence[str]) -> Any:
+def outcome(time_utc_ns: int) -> Any:
     """An outcome without measured Y, as far as the loop looks at it."""
     return SimpleNamespace(
         sample=SimpleNamespace(time_utc_ns=time_utc_ns, period_s=60.0),
         estimate=SimpleNamespace(residual_um=math.nan, y_um=math.nan),
-        offset=SimpleNamespace(reasons=list(reasons)),
+        offset=SimpleNamespace(reasons=[]),
         notes=[],
         probes=(),
     )
 
 
-def diagnosed(
-    loop: Loop,
-    hours: int,
-    reasons: Callable[[int], Sequence[str]] = lambda i: (),
-    ahead_ns: Callable[[int], int] = lambda i: 0,
-) -> list[tuple[int, str]]:
+def diagnosed(loop: Loop, hours: int, ahead_ns: Callable[[int], int]) -> list[tuple[int, str]]:
     """Run a loop for some hours, in which each diagnosis finds nothing; return when each begins, min, and why."""
     found = []
     for i in range(1, 60 * hours):
         now_ns = START_NS + 60 * i * NS + ahead_ns(i)
-        one = outcome(now_ns, reasons(i))
+        one = outcome(now_ns)
         notes = loop.step(one, {place.sha256: one for place in loop.state.taken})
         found += [(i, note.data["why"]) for note in notes if note.data["step"] == "diagnose"]
         if loop.state.diagnosis is not None:

@@ -31,9 +31,8 @@ def is_disturbed(reasons: Sequence[str]) -> bool:
 
 def is_lost(reasons: Sequence[str]) -> bool:
     """Return whether a sample lacks a temperature, and no channel is suspected: a line loses a reading now and then."""
-    return any(reason in _LOST for reason in reasons) and not any(
-        reason.startswith(Reason.SUSPECT_CHANNEL) or reason in _FAULTS for reason in reasons
-    )
+    is_missing = any(reason.startswith(_LOST) for reason in reasons)
+    return is_missing and not any(reason.startswith((Reason.SUSPECT_CHANNEL, *_FAULTS)) for reason in reasons)
 
 
 def is_contradicted(reasons: Sequence[str]) -> bool:
