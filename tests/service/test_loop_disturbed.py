@@ -95,12 +95,12 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
 def test_effects_that_were_gone_back_from_wait_a_day_and_then_twice_as_long() -> None:
     state, effects, waits = LoopState(), ["input:coolant_degc"], []
     for now_h in (0, 30, 100):
-        avoid_after_back(state, effects, now_h * HOUR_NS, first_h=24.0, longest_h=168.0)
+        avoid_after_back(state, effects, now_h * HOUR_NS, longest_h=168.0)
         waits.append((state.avoided[-1].until_utc_ns - now_h * HOUR_NS) / HOUR_NS)
     assert waits == [24.0, 48.0, 96.0]
     assert is_avoided(state, effects, 195 * HOUR_NS) and not is_avoided(state, effects, 197 * HOUR_NS)
     # After a week without it counts anew.
-    avoid_after_back(state, effects, 1000 * HOUR_NS, first_h=24.0, longest_h=168.0)
+    avoid_after_back(state, effects, 1000 * HOUR_NS, longest_h=168.0)
     assert state.avoided[-1].until_utc_ns == 1024 * HOUR_NS
 
 

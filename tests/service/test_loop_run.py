@@ -268,15 +268,6 @@ def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
     assert len(night.asked) == 2 and steps[-1].candidates
 
 
-def test_between_two_adoptions_is_a_day() -> None:
-    night = Night(shown(extended(1.5)), shown(extended(3.0)))
-    tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
-    loop = LoopRun(settings(**tables), QUILL, night)
-    steps = run(loop, machine(4 * DAY))
-    adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
-    assert len(adopted) == 2 and adopted[1] - adopted[0] >= DAY
-
-
 def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
     tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
     loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))

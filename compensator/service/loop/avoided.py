@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from compensator.clock import NS
 from compensator.service.loop.state import Avoided, LoopState
 
+#: For how long effects are avoided when the service has gone back from them for the first time, h.
+FIRST_H = 24.0
 _HOUR_NS = 3600 * NS
 
 
@@ -21,13 +23,11 @@ def avoid(state: LoopState, effects: Sequence[str], now_ns: int, hours: float) -
     state.avoided = [*state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
 
 
-def avoid_after_back(
-    state: LoopState, effects: Sequence[str], now_ns: int, *, first_h: float, longest_h: float
-) -> None:
+def avoid_after_back(state: LoopState, effects: Sequence[str], now_ns: int, *, longest_h: float) -> None:
     """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
     oldest_ns = now_ns - round(longest_h * _HOUR_NS)
     state.avoided = [one for one in state.avoided if one.until_utc_ns > oldest_ns]
-    avoid(state, effects, now_ns, min(first_h * 2 ** len(_alike(state, effects)), longest_h))
+    avoid(state, effects, now_ns, min(FIRST_H * 2 ** len(_alike(state, effects)), longest_h))
 
 
 def _alike(state: LoopState, effects: Sequence[str]) -> list[Avoided]:

@@ -15,7 +15,7 @@ from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
-from compensator.service.loop.place import ADOPTION_H, is_asked, leads
+from compensator.service.loop.place import is_asked, leads
 from compensator.service.loop.proof import is_clearly_better
 from compensator.service.loop.state import LoopState, Place
 
@@ -52,7 +52,9 @@ class Choice:
         return [
             place
             for place in sorted(self._state.candidates, key=lambda place: -place.shows)
-            if (place in judged or not place.is_proposed) and self._compared(place).is_better(now_ns)
+            if (place in judged or not place.is_proposed)
+            and not place.limited_min
+            and self._compared(place).is_better(now_ns)
         ]
 
     def adopted(self, better: Sequence[Place], now_ns: int) -> Place | None:
@@ -79,10 +81,13 @@ class Choice:
     def _may_adopt(self, now_ns: int) -> bool:
         """Return whether the loop may adopt a model now.
 
-        Not while the model before the last adoption is better so far: it would give its place to the present one.
+        Not before the present one has been in force for as long as a candidate is compared at least; and not while the
+        model before the last adoption is better so far: it would give its place to the present one.
         """
         state, since_ns = self._state, now_ns - self._state.adopted_utc_ns
-        if self._settings.policy != "adopt" or (state.adopted_utc_ns and since_ns < ADOPTION_H * 3600 * NS):
+        if self._settings.policy != "adopt":
+            return False
+        if state.adopted_utc_ns and since_ns < self._settings.shadow_h * 3600 * NS:
             return False
         return state.watched is None or not leads(state.watched.verdict, self._settings)
 

@@ -11,7 +11,6 @@ from compensator.events import Note
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, withdraw
-from compensator.service.loop.place import ADOPTION_H
 from compensator.service.loop.state import Exchange, LoopState, Place
 
 
@@ -48,7 +47,7 @@ def exchanged(
     incoming = state.place(state.incoming)
     assert incoming is not None
     before, state.effects, state.exchange, state.incoming = state.effects, incoming.effects, "", ""
-    state.error.clear()
+    state.model_changed()
     state.remove(incoming)
     running, notes = state.diagnosis, list[Note]()
     if running is not None and running.candidate_sha256:
@@ -56,7 +55,7 @@ def exchanged(
     for place in state.found:
         compared(place).go_on_beside(incoming, level_um)
     if back:
-        avoid_after_back(state, before, now_ns, first_h=ADOPTION_H, longest_h=settings.watch_h)
+        avoid_after_back(state, before, now_ns, longest_h=settings.watch_h)
         if state.watched is not None:
             notes += end(state, state.watched, "replaced")
         for place in state.found:

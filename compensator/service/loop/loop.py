@@ -24,6 +24,7 @@ from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
 from compensator.service.loop.level import ErrorBlocks
+from compensator.service.loop.misfit import count_misfit
 from compensator.service.loop.place import (
     falls,
     gives_way,
@@ -36,7 +37,7 @@ from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
-from compensator.service.loop.trust import all_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed, is_lost
+from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted, is_disturbed, is_lost
 from compensator.service.loop.words import begins, named, nothing_follows, surpassed
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN
@@ -110,35 +111,38 @@ class Loop:
             The decisions, each with the figures on which it rests.
         """
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
-        minutes, suspected = self._period_s / 60.0, is_contradicted(reasons)
+        minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
         forget_future(state, now_ns)
-        if others:
-            suspected = suspected or all_suspect_a_sensor([present, *others.values()])
+        suspected = contradicted or (bool(others) and all_suspect_a_sensor([present, *others.values()]))
+        state.usable_min = _counted(state.usable_min, present, minutes, suspected=contradicted)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
-        state.misfit_min = state.misfit_min + minutes if is_alarmed(reasons) else 0.0
+        count_misfit(state, present, minutes)
         state.error.update(present)
         notes: list[Note] = []
         judged: list[Place] = []
         for place in state.taken:
             compared, other = self.compared(place), others[place.sha256]
-            if not suspected:
+            beyond = is_limited(other) and not is_limited(present)
+            place.limited_min = place.limited_min + minutes if beyond else 0.0
+            # A newcomer that no sensor speaks against says nothing of two older models that both suspect one.
+            if not (contradicted or all_suspect_a_sensor([present, other])):
                 judged += [place] if compared.add(present, other) else []
             elif compared.add_suspected(other) and place.is_proposed and not state.exchange:
                 notes += withdraw(self.state, place, "a sensor is suspected, so what was compared does not count")
         for place in state.taken:
             # Until what is warmed up has its place, before the next sample, nothing that was found decides.
             if not state.exchange and (place is state.watched or not state.has_next):
-                notes += self._decide(place, now_ns, present, others[place.sha256], is_judged=place in judged)
+                notes += self._decide(place, now_ns, is_judged=place in judged)
         if judged and not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
             notes += self._choose(judged, now_ns)
         return notes + self._schedule(now_ns)
 
     # ------------------------------------------------------------------ decisions about a shadow
 
-    def _decide(self, place: Place, now_ns: int, present: Outcome, other: Outcome, *, is_judged: bool) -> list[Note]:
+    def _decide(self, place: Place, now_ns: int, *, is_judged: bool) -> list[Note]:
         """Decide about one model: whether it ends, a proposal falls, or the service goes back to it."""
         is_candidate, verdict = place.role == "candidate", place.verdict.verdict
-        if is_candidate and is_limited(other) and not is_limited(present):
+        if is_candidate and place.limited_min >= CLEAN_MIN:
             return end(self.state, place, "limits")
         if now_ns - place.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
             unshown = "no_answer" if place.is_proposed else "no_difference"
@@ -193,7 +197,7 @@ class Loop:
         """Begin a diagnosis if it is time, and nothing speaks against it."""
         state = self.state
         planned_ns = pass_planned(state, self._settings, now_ns)
-        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
+        if state.diagnosis is not None or state.exchange or state.usable_min < CLEAN_MIN:
             return []
         return begin_if_due(state, self._settings, now_ns, planned_ns)
 
@@ -309,7 +313,7 @@ class Loop:
         if back:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
         state.effects = list(effects)
-        state.error.clear()
+        state.model_changed()
         return self.give_up("by_hand", "a person has changed the model or the configuration")
 
     def give_up(self, why: str, text: str) -> list[Note]:

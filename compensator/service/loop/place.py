@@ -17,12 +17,11 @@ from compensator.service.loop.proof import BETTER_PART, CANDIDATES
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
 
-#: Least time between two adoptions, which is that after going back from a model, too, h.
-ADOPTION_H = 24.0
 #: A model is better so far if it has shown this part of the deviations that it must show.
 LEADS = 0.5
-#: A candidate with the effects of the present model must differ from it by so many standard deviations.
-DIFFERS = 4.0
+#: A candidate with the effects of the present model must differ from it by so many standard deviations: what is closer
+#: is the same. Which of the two is better is not decided by this.
+DIFFERS = 1.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
 #: is diagnosed.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0

@@ -61,6 +61,8 @@ class Place(msgspec.Struct, kw_only=True):
         The last verdict on it.
     error : ErrorBlocks
         Its errors since the last zero, on the record before the comparison, too.
+    limited_min : float
+        For how long it has been at a limit that the present model keeps, min.
     """
 
     sha256: str
@@ -72,6 +74,7 @@ class Place(msgspec.Struct, kw_only=True):
     comparison: ComparisonState = msgspec.field(default_factory=ComparisonState)
     verdict: ComparisonData = NO_VERDICT
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
+    limited_min: float = 0.0
 
     def begin_anew(self) -> None:
         """Forget what was compared."""
@@ -112,8 +115,13 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         A diagnosis that was begun.
     planned_utc_ns, diagnosed_utc_ns : int
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
-    misfit_min, clean_min : float
-        For how long the model has been suspected, and no sensor, as far as that is counted, min.
+    misfit_min : float
+        For how long the model has been suspected, min.
+    probes_shown : list of float
+        What the last probes have shown beyond the prediction, standard deviations.
+    clean_min, usable_min : float
+        For how long no sensor has been suspected, and no sensor has shown a fault by itself, as far as that is counted,
+        min: decisions wait for the first, diagnoses for the second.
     found : list of Place
         What diagnoses have found: candidates, and the calibrated model.
     watched : Place, optional
@@ -136,7 +144,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
+    probes_shown: list[float] = []
     clean_min: float = 0.0
+    usable_min: float = 0.0
     found: list[Place] = []
     watched: Place | None = None
     adopted_utc_ns: int = 0
@@ -157,6 +167,11 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         """Let a model go."""
         self.watched = None if place is self.watched else self.watched
         self.found = [one for one in self.found if one is not place]
+
+    def model_changed(self) -> None:
+        """Forget what was wrong with the model before."""
+        self.error.clear()
+        self.probes_shown = []
 
     @property
     def candidates(self) -> list[Place]:

@@ -1,0 +1,38 @@
+"""For how long measured Y has contradicted the present model: the residual of a displacement sensor, or probes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from compensator.messages import number
+from compensator.service.loop.state import LoopState
+from compensator.service.loop.trust import is_alarmed
+from compensator.service.outcome import Outcome
+from compensator.service.probing import UNKNOWN_UM
+
+#: Probes that are judged together, and the sum of their squares that a right model exceeds once in a thousand times
+#: (chi-square of eight degrees of freedom). What each shows beyond the prediction is in its standard deviations.
+_TOGETHER, _UNEXPECTED = 8, 26.1
+#: No probe counts for more deviations: one chip is no misfit.
+_CLIP = 3.0
+#: Probes that are remembered. A correction by probes soon takes a misfit away, and does not explain it.
+_REMEMBERED = 24
+
+
+def count_misfit(state: LoopState, present: Outcome, minutes: float) -> None:
+    """Count a sample: the time of a misfit goes on while measured Y, or what probes have shown, is unexpected."""
+    shown = [
+        max(-_CLIP, min(_CLIP, number(probe.innovation_um) / number(probe.innovation_std_um)))
+        for probe in present.probes
+        if number(probe.innovation_std_um) < UNKNOWN_UM
+    ]
+    if shown:
+        state.probes_shown = [*state.probes_shown, *shown][-_REMEMBERED:]
+    is_misfit = is_alarmed(present.offset.reasons) or _is_unexpected(state.probes_shown)
+    state.misfit_min = state.misfit_min + minutes if is_misfit else 0.0
+
+
+def _is_unexpected(shown: Sequence[float]) -> bool:
+    """Return whether some probes in a row show more than a right model lets expect."""
+    rows = (shown[i : i + _TOGETHER] for i in range(len(shown) - _TOGETHER + 1))
+    return any(sum(each * each for each in row) > _UNEXPECTED for row in rows)

@@ -1,0 +1,186 @@
+"""A loop on outcomes made by hand: the present model lacks an effect of some µm, the other one has it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from compensator.clock import NS
+from compensator.config import Loop as LoopSettings
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
+from compensator.service.loop.choice import Choice
+from compensator.service.loop.loop import Loop
+from compensator.service.loop.shadow import Role
+from compensator.service.loop.state import Place, decode_loop
+from compensator.service.outcome import Outcome
+
+#: A planned diagnosis is 8 h later.
+BEGIN_NS = 1_767_592_800 * NS
+SUSPECT = ("implausible:t_q_degc",)
+DEAD = ("channel_missing:coolant_degc",)
+Reasons = Callable[[int], Sequence[str]]
+
+
+def outcome(minute: int, residual_um: float, y_um: float, reasons: Sequence[str], *probes_um: float) -> Outcome:
+    """An outcome as far as the loop reads it; a probe shows so much beyond the prediction, ±1.5 µm."""
+    shown = [SimpleNamespace(innovation_um=one, innovation_std_um=1.5, taken=True) for one in probes_um]
+    sample = SimpleNamespace(time_utc_ns=BEGIN_NS + minute * 60 * NS, period_s=60.0)
+    estimate = SimpleNamespace(residual_um=residual_um, y_um=y_um)
+    offset = SimpleNamespace(reasons=list(reasons))
+    return cast(Outcome, SimpleNamespace(sample=sample, estimate=estimate, offset=offset, notes=[], probes=shown))
+
+
+def place(name: str, role: Role = "candidate") -> Place:
+    return Place(sha256=name * 64, effects=[f"input:{name}"], role=role, since_utc_ns=BEGIN_NS)
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What a loop has decided, and when."""
+
+    hour: float
+    step: str
+    why: str
+
+
+def decided(loop: Loop, hours: float, present: Reasons, others: dict[str, Reasons]) -> Iterator[Decided]:
+    """Run a loop, until it exchanges models; diagnoses find nothing. Others are named by their first letter."""
+    noise = np.random.default_rng(1)
+    for minute in range(1, round(60 * hours)):
+        effect_um = 5.0 * math.sin(minute / 90.0) + 3.0 * math.sin(minute / 37.0)
+        y_um = 30.0 * math.sin(minute / 70.0) + effect_um
+        own, other = noise.normal(0.0, 0.4, 2)
+        known = {one.sha256: outcome(minute, other, y_um, others[one.sha256[0]](minute)) for one in loop.state.taken}
+        for note in loop.step(outcome(minute, effect_um + own, y_um, present(minute)), known):
+            yield Decided(minute / 60.0, note.data["step"], note.data.get("why", ""))
+        if loop.state.diagnosis is not None:
+            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), BEGIN_NS + minute * 60 * NS)
+        if loop.state.exchange:
+            return
+
+
+def loop_of(*found: Place, watched: Place | None = None, **settings: Any) -> Loop:
+    loop = Loop(LoopSettings(policy="adopt", **settings), 60.0, ["gain:DTF"])
+    loop.state.found, loop.state.watched = list(found), watched
+    return loop
+
+
+def never(_minute: int) -> Sequence[str]:
+    return ()
+
+
+def after(first: int, reasons: Sequence[str] = SUSPECT) -> Reasons:
+    return lambda minute: reasons if minute >= first else ()
+
+
+def between(first: int, end: int) -> Reasons:
+    return lambda minute: ("offset_limited",) if first <= minute < end else ()
+
+
+def test_what_is_better_is_adopted_once_its_hours_show_it() -> None:
+    assert list(decided(loop_of(place("a")), 24, never, {"a": never})) == [Decided(6.0, "adopt", "")]
+
+
+def test_models_that_all_err_are_diagnosed_while_nothing_is_decided() -> None:
+    with_one = list(decided(loop_of(watched=place("b", "before")), 30, after(121), {"b": after(121)}))
+    alone = list(decided(loop_of(), 30, after(121), {}))
+    assert with_one == alone and {one.step for one in with_one} == {"diagnose"}
+    assert with_one[0] == Decided(5.0, "diagnose", "misfit")
+
+
+def test_a_newcomer_without_an_alarm_lets_no_older_models_judge_that_have_one() -> None:
+    loop = loop_of(place("a"), place("n"))
+    notes = decided(loop, 24, after(0), {"a": after(0), "n": never})
+    assert [(one.step, one.why) for one in notes if one.step != "diagnose"] == [("adopt", "")]
+    assert loop.state.incoming[0] == "n"
+    assert loop.state.found[0].comparison.first_ns == 0 < loop.state.found[1].comparison.first_ns
+
+
+def test_what_was_compared_before_both_models_had_an_alarm_is_forgotten() -> None:
+    loop = loop_of(place("a"), place("n"))
+    list(decided(loop, 5, after(240), {"a": after(240), "n": never}))
+    assert loop.state.found[0].comparison.first_ns == 0 < loop.state.found[1].comparison.first_ns
+
+
+@pytest.mark.parametrize(("role", "expected"), [("before", "back"), ("candidate", "")])
+def test_a_dead_channel_of_the_model_in_force_does_not_block_the_way_back(role: Role, expected: str) -> None:
+    other = place("b", role)
+    loop = loop_of(watched=other) if role == "before" else loop_of(other)
+    steps = [one.step for one in decided(loop, 30, lambda _: DEAD, {"b": never}) if one.step != "diagnose"]
+    assert steps == ([expected] if expected else [])
+
+
+@pytest.mark.parametrize("role", ["before", "candidate"])
+def test_a_model_that_lacks_a_channel_is_not_judged(role: Role) -> None:
+    other = place("b", role)
+    loop = loop_of(watched=other) if role == "before" else loop_of(other)
+    assert {one.step for one in decided(loop, 30, never, {"b": lambda _: DEAD})} == {"diagnose"}
+
+
+@pytest.mark.parametrize(("minutes", "expected"), [(29, [("adopt", "")]), (30, [("end", "limits")])])
+def test_a_candidate_ends_by_a_limit_where_it_stays_there(minutes: int, expected: list[tuple[str, str]]) -> None:
+    limited = between(240, 240 + minutes)
+    steps = [(one.step, one.why) for one in decided(loop_of(place("a")), 7, never, {"a": limited})]
+    assert steps[:1] == expected
+
+
+def test_a_candidate_at_a_limit_is_not_adopted() -> None:
+    limited = between(350, 371)
+    assert next(decided(loop_of(place("a")), 8, never, {"a": limited})).hour > 371 / 60
+
+
+@pytest.mark.parametrize(("hours", "may"), [(5.9, False), (6.1, True)])
+def test_a_model_stays_in_force_for_as_long_as_a_candidate_is_compared(hours: float, *, may: bool) -> None:
+    found, now_ns = place("a"), BEGIN_NS + 20 * 3600 * NS
+    loop = loop_of(found)
+    loop.state.adopted_utc_ns = now_ns - round(hours * 3600) * NS
+    found.verdict = ComparisonData(
+        verdict=ComparisonVerdict.BETTER,
+        measured_by="sensor",
+        present_rms_um=5.0,
+        candidate_rms_um=1.0,
+        deviations=9.0,
+        ratio=0.3,
+    )
+    choice = Choice(loop.state, LoopSettings(policy="adopt"), loop.compared)
+    assert choice.adopted([found], now_ns) is (found if may else None)
+
+
+def probed(loop: Loop, *innovations_um: float, every: int = 40) -> list[tuple[float, str]]:
+    """Run a machine with probes alone; return the diagnoses that begin, and why."""
+    begun = []
+    for minute in range(1, 1440):
+        index, rest = divmod(minute, every)
+        shown = innovations_um[index % len(innovations_um)] if rest == 0 else None
+        present = outcome(minute, math.nan, math.nan, (), *([] if shown is None else [shown]))
+        begun += [(minute / 60.0, note.data["why"]) for note in loop.step(present, {})]
+        if loop.state.diagnosis is not None:
+            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), BEGIN_NS + minute * 60 * NS)
+    return begun
+
+
+def test_probes_that_show_more_than_is_expected_are_a_misfit() -> None:
+    quiet, chip = [1.0, -1.6, 0.4, 1.9, -0.7], 40.0
+    planned = [(8.0, "planned"), (20.0, "planned")]
+    assert probed(loop_of(), *quiet) == planned
+    assert probed(loop_of(), *quiet, *quiet, chip, *quiet, *quiet) == planned  # one chip is none
+    # An effect shows in a few probes, and the correction by probes takes it away; then 3 h until a diagnosis.
+    effect = [*quiet, *quiet, -6.0, 5.0, 4.0, -3.0, *quiet * 10]
+    hour, why = probed(loop_of(), *effect)[1]
+    assert why == "misfit" and 8.5 < hour < 12.5
+
+
+def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> None:
+    loop = loop_of()
+    probed(loop, -6.0, 5.0)
+    assert loop.state.misfit_min > 0.0 and decode_loop(msgspec.json.encode(loop.state)) == loop.state
+    loop.model_changed(["gain:DTF"], BEGIN_NS + 1440 * 60 * NS)
+    loop.step(outcome(1441, math.nan, math.nan, ()), {})
+    assert loop.state.misfit_min == 0.0
