@@ -13,6 +13,7 @@ from rich.text import Text
 
 from compensator.clock import NS
 from compensator.codes import SampleQuality, WatchWarning
+from compensator.errors import one_line
 from compensator.report.local_time import here, zone
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
@@ -63,10 +64,12 @@ def view(
     """
     machines = shop.overview()
     now = here(shop.now_ns())
-    about = Text(f"{prefix or 'everything'} at {where}, {now:%Y-%m-%d %H:%M:%S} {zone(now)}", style="dim")
-    parts: list[RenderableType] = [Text(headline(machines), style="bold"), about]
+    about = _text(f"{prefix or 'everything'} at {where}, {now:%Y-%m-%d %H:%M:%S} {zone(now)}", style="dim")
+    parts: list[RenderableType] = [_text(headline(machines), style="bold"), about]
     if not connected:
-        parts.append(Text(f"✗ No connection to {where}; retrying. The values below are out of date.", style="bold red"))
+        parts.append(
+            _text(f"✗ No connection to {where}; retrying. The values below are out of date.", style="bold red")
+        )
     if len(machines) == 1:
         history = shop.history(machines[0]["prefix"])
         short = stays and console.height < TALL
@@ -77,7 +80,7 @@ def view(
         parts += _to_do(machines[:rows], console.width, console.height - 8 - len(machines))
     if shop.ignored:
         parts.append(
-            Text(f"{shop.ignored} message(s) with unknown keys or of further machines ignored.", style="yellow")
+            _text(f"{shop.ignored} message(s) with unknown keys or of further machines ignored.", style="yellow")
         )
     if stays:
         parts.append(Text("Ctrl-C ends the view. Nothing is sent to the machines.", style="dim"))
@@ -89,7 +92,7 @@ def _to_do(machines: Sequence[dict[str, Any]], width: int, rows: int) -> list[Re
     lines: list[RenderableType] = []
     for machine in machines:
         found = machine["headline"]
-        text = Text(
+        text = _text(
             f"{SIGNS[machine['tone']]} {machine['prefix']} {machine['shown']}: {found['word']}. {found['text']}"
         )
         rows -= -(-text.cell_len // max(width - 2, 1))
@@ -133,13 +136,13 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
         cells = _cells(machine)
         if "last 24 h" in names:
             history = shop.history(machine["prefix"])
-            cells["last 24 h"] = Text(sparkline(evenly(history["t_s"], history["y_offset_um"], 24)))
+            cells["last 24 h"] = _text(sparkline(evenly(history["t_s"], history["y_offset_um"], 24)))
         table.add_row(*(cells[name] for name in names))
     left_out = machines[len(shown) :]
     if not left_out:
         return table
     return Group(
-        table, Text(f"… and {len(left_out)} more ({headline(list(left_out)).partition(': ')[2]})", style="bold")
+        table, _text(f"… and {len(left_out)} more ({headline(list(left_out)).partition(': ')[2]})", style="bold")
     )
 
 
@@ -148,19 +151,19 @@ def _cells(machine: dict[str, Any]) -> dict[str, Text]:
     reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != WatchWarning.SILENT else []
     why = " ".join([*reasons, *machine["warning_codes"]])
     return {
-        "machine": Text(machine["prefix"]),
+        "machine": _text(machine["prefix"]),
         "state": state(machine),
-        "offset µm": Text(
+        "offset µm": _text(
             signed(machine["y_offset_um"]), style="dim" if machine["shown"] == WatchWarning.SILENT else ""
         ),
-        "µm/min": Text(signed(machine["y_offset_rate_um_per_min"])),
-        "std µm": Text(plain(machine["y_offset_std_um"])),
-        "residual µm": Text(signed(machine["residual_um"])),
-        "T_Q °C": Text(plain(machine["t_q_degc"])),
-        "AT °C": Text(plain(machine["at_degc"])),
-        "age": Text(age(machine["age_s"]) if machine["age_s"] is not None else "–"),
-        "alive": Text(_alive(machine)),
-        "reasons": Text(why),
+        "µm/min": _text(signed(machine["y_offset_rate_um_per_min"])),
+        "std µm": _text(plain(machine["y_offset_std_um"])),
+        "residual µm": _text(signed(machine["residual_um"])),
+        "T_Q °C": _text(plain(machine["t_q_degc"])),
+        "AT °C": _text(plain(machine["at_degc"])),
+        "age": _text(age(machine["age_s"]) if machine["age_s"] is not None else "–"),
+        "alive": _text(_alive(machine)),
+        "reasons": _text(why),
     }
 
 
@@ -171,7 +174,7 @@ def _alive(machine: dict[str, Any]) -> str:
 def state(machine: dict[str, Any]) -> Text:
     """Return the shown state of a machine with its sign."""
     tone = machine["tone"]
-    return Text(f"{SIGNS[tone]} {machine['shown']}", style=STYLES[tone])
+    return _text(f"{SIGNS[tone]} {machine['shown']}", style=STYLES[tone])
 
 
 # ---------------------------------------------------------------------------- one machine
@@ -200,7 +203,7 @@ def detail(
     per_row = 1 + (width >= 60) + 2 * (width >= 110)
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
-        numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
+        numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (_text(name, style="dim"), value)))
     intervals = state_intervals(history, machine["valid_for_s"])[: INTERVALS // 2 if short else INTERVALS]
     past = [_interval_text(interval, now_ns) for interval in intervals]
     lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
@@ -210,15 +213,14 @@ def detail(
         Text(""),
         numbers,
         *_axes(machine),
-        *([Text(probe_text(machine["probe"]))] if machine["probe"] is not None else []),
-        *(Text(line) for line in _loop_lines(machine)),
-        *([] if short else [Text(_about(machine), style="dim")]),
+        *([_text(probe_text(machine["probe"]))] if machine["probe"] is not None else []),
+        *(_text(line) for line in _loop_lines(machine)),
+        *([] if short else [_text(_about(machine), style="dim")]),
         *drawn(history, width - 4, short=short),
     ]
     parts += [_titled(title, lines) for title, lines in lists[len(urgent) :]]
-    return Panel(
-        Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=STYLES[machine["tone"]]
-    )
+    title = _text(f"{machine['machine']}  ({machine['prefix']})")
+    return Panel(Group(*parts), title=title, border_style=STYLES[machine["tone"]])
 
 
 def _axes(machine: dict[str, Any]) -> list[RenderableType]:
@@ -231,13 +233,13 @@ def _axes(machine: dict[str, Any]) -> list[RenderableType]:
     for axis in machine["axes"]:
         slope = f"{signed(axis['slope_um_per_m'])} µm/m" if "slope_um_per_m" in axis else ""
         table.add_row(
-            axis["label"],
-            Text(axis["state"] or "not received", style=STYLES[TONES.get(axis["state"] or "", "bad")]),
+            _text(axis["label"]),
+            _text(axis["state"] or "not received", style=STYLES[TONES.get(axis["state"] or "", "bad")]),
             f"{signed(axis['offset'])} {axis['unit']}",
             signed(axis["rate_per_min"]),
             plain(axis["std"]),
             slope,
-            " ".join(axis["reasons"]),
+            _text(" ".join(axis["reasons"])),
         )
     return [Text(""), table]
 
@@ -254,31 +256,31 @@ def _loop_lines(machine: dict[str, Any]) -> list[str]:
 def _verdict(machine: dict[str, Any]) -> Text:
     """Return whether one may cut, why, and the state with the offset."""
     found, style = machine["headline"], STYLES[machine["tone"]]
-    text = Text(f"{SIGNS[machine['tone']]} {found['word']}", style=f"bold {style}")
-    text.append(f"  {found['text']}\n", style="")
+    text = _text(f"{SIGNS[machine['tone']]} {found['word']}", style=f"bold {style}")
+    text.append(f"  {one_line(found['text'])}\n", style="")
     old = age(machine["age_s"]) if machine["age_s"] is not None else ""
-    text.append(machine["shown"], style=style)
+    text.append(one_line(machine["shown"]), style=style)
     if machine["shown"] == WatchWarning.SILENT:
         text.append(f" for {old}; the last offset was {signed(machine['y_offset_um'])} µm", style="bold red")
     elif machine["y_offset_um"] is None and machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  no offset, {old} old", style="bold")
     elif machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  offset {signed(machine['y_offset_um'])} µm, {old} old", style="bold")
-    text.append(f"\n{machine['means']}", style="dim")
+    text.append(f"\n{one_line(machine['means'])}", style="dim")
     return text
 
 
 def _pairs(machine: dict[str, Any]) -> list[tuple[str, Text]]:
     return [
-        ("rate, µm/min", Text(signed(machine["y_offset_rate_um_per_min"]))),
-        ("std, µm", Text(plain(machine["y_offset_std_um"]))),
-        ("measured Y, µm", Text(signed(machine["y_um"]))),
-        ("residual, µm", Text(signed(machine["residual_um"]))),
-        ("T_Q, °C", Text(plain(machine["t_q_degc"]))),
-        ("AT, °C", Text(plain(machine["at_degc"]))),
-        ("heat, W", Text(plain(machine["heat_w"], 1))),
-        ("predicted Y, µm", Text(signed(machine["y_pred_um"]))),
-        *((f"{share['name']}, µm", Text(signed(share["y_um"]))) for share in machine["shares"]),
+        ("rate, µm/min", _text(signed(machine["y_offset_rate_um_per_min"]))),
+        ("std, µm", _text(plain(machine["y_offset_std_um"]))),
+        ("measured Y, µm", _text(signed(machine["y_um"]))),
+        ("residual, µm", _text(signed(machine["residual_um"]))),
+        ("T_Q, °C", _text(plain(machine["t_q_degc"]))),
+        ("AT, °C", _text(plain(machine["at_degc"]))),
+        ("heat, W", _text(plain(machine["heat_w"], 1))),
+        ("predicted Y, µm", _text(signed(machine["y_pred_um"]))),
+        *((f"{share['name']}, µm", _text(signed(share["y_um"]))) for share in machine["shares"]),
     ]
 
 
@@ -333,7 +335,7 @@ def _interval_text(interval: StateInterval, now_ns: int) -> str:
 def _titled(title: str, lines: list[str]) -> RenderableType:
     table = Table.grid(padding=(0, 1))
     for line in lines:
-        table.add_row(Text("•"), Text(line))
+        table.add_row(Text("•"), _text(line))
     return Group(Text(f"\n{title}", style="bold"), table)
 
 
@@ -364,4 +366,9 @@ def line(machine: dict[str, Any]) -> str:
         *(["better model proposed"] if machine.get("loop", {}).get("phase") == "proposed" else []),
         *machine["warnings"],
     ]
-    return "  ".join(words)
+    return one_line("  ".join(words))
+
+
+def _text(content: str, style: str = "") -> Text:
+    """Return a text on one line: it may hold a name or a value of a stranger."""
+    return Text(one_line(content), style=style)

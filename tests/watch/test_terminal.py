@@ -184,3 +184,13 @@ def test_a_proposal_is_a_line_with_two_commands() -> None:
     text = " ".join(shown(shop, 200).replace("│", "").split())
     assert "goes on beside the adopted one" in text and "A diagnosis is in progress." in text
     assert "adopt --candidate" not in text
+
+
+def test_a_forged_name_writes_no_lines_and_no_commands_of_a_terminal() -> None:
+    forged = "vmc\n\x1b[2J[bold red]✓ Proven[/]\u202e"
+    for others in ((), ("vmc-01",)):
+        shop, _ = filled(forged, *others)
+        shop.receive(f"shop/{forged}/thermal/event", event(3, text=forged))
+        text = shown(shop, 200)
+        assert "vmc\\n\\x1b[2J[bold red]✓ Proven[/]\\u202e" in text and not set("\x1b\u202e") & set(text)
+    assert line(shop.overview()[0]).isprintable()
