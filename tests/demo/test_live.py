@@ -34,6 +34,8 @@ from sim_hardware.wire import Faults
 from tests.cli.test_adopt import free_port
 
 QUILL = Path(__file__).parents[2] / "compensator/model/quill.toml"
+#: How often a device is asked that must answer.
+ATTEMPTS = 30
 
 
 @contextmanager
@@ -66,14 +68,23 @@ def readings(config: Path) -> list[str]:
     return found
 
 
+def readings_become(config: Path, expected: list[str]) -> list[str]:
+    """The qualities; asked again only while a device that must answer has been late, on a busy computer."""
+    for _ in range(ATTEMPTS):
+        found = readings(config)
+        if all(a == b or a != "device_timeout" for a, b in zip(found, expected, strict=True)):
+            break
+    return found
+
+
 def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
     with hardware(world) as (lines, capa, faults), streaming(capa):
         config = tmp_path / "machine.toml"
         config.write_text(configuration("vmc-07", lines, 7447), encoding="utf-8")
-        sound = readings(config)
-        assert sound == ["good", "good", "good"]
+        sound = ["good", "good", "good"]
+        assert readings_become(config, sound) == sound
         for line, number, expected in (
             ("break t_q", 0, "open_circuit"),
             ("unplug at", 1, "device_timeout"),
@@ -81,9 +92,10 @@ def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
             ("unplug y", 2, "device_disconnected"),
         ):
             assert apply_fault(line + "\n", faults).startswith(f"{line}: done")
-            assert readings(config) == [*sound[:number], expected, *sound[number + 1 :]]
+            broken = [*sound[:number], expected, *sound[number + 1 :]]
+            assert readings_become(config, broken) == broken
             assert apply_fault("mend\n", faults) == "all sensors repaired"
-            assert readings(config) == sound, line
+            assert readings_become(config, sound) == sound, line
 
 
 def test_what_is_promised_of_a_frozen_value_is_what_is_configured(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from tests.service.simulated import TABLE, config
 from tests.service.wired import WiredMachine, workshop
 
 LIMITS = {"t_q_below_at_after_min": 15.0, "false_alarm_days": 365.0, "residual_std_um": 0.3}
-#: No device is silent here: a longer time-out keeps a busy computer from looking like one that is.
-WIRED: dict[str, Any] = {"plausibility": LIMITS, "timeout_s": 1.0}
+#: No device is silent here, and a busy computer must not look like one that is.
+WIRED: dict[str, Any] = {"plausibility": LIMITS, "timeout_s": 1.0, "is_patient": True}
 CHANNELS = [*TABLE["channel"][:3], {"name": "heat_w", "device": "module", "input": 4}]
 Change = Callable[[int, dict[str, float]], None]
 

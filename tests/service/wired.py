@@ -29,7 +29,10 @@ from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher, session_config
+from drivers import catalog
 from drivers.errors import DriverError
+from drivers.families.base import Line
+from drivers.lines.settings import CapancdtLine, LineSettings
 from sim_hardware.physics import World
 from sim_hardware.wire import (
     CapaNcdt,
@@ -94,11 +97,30 @@ class Receiver:
             assert self._arrived.wait_for(lambda: bool(got) and got[-1].seq >= seq, PATIENCE_S), (machine, name, seq)
 
 
+@contextlib.contextmanager
+def patient_lines() -> Iterator[None]:
+    """Build lines that wait far longer for a reply than a configuration may say: for devices that all answer.
+
+    Not those that send by themselves: who reads them before they have sent anything waits for nothing.
+    """
+    made = catalog._new_line
+
+    def patient(config: LineSettings) -> Line:
+        is_asked = not isinstance(config, CapancdtLine)
+        return made(msgspec.structs.replace(config, timeout_s=PATIENCE_S) if is_asked else config)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalog, "_new_line", patient)
+        yield
+
+
 class WiredMachine:
     """One machine on its wires.
 
     Layouts: `apart` has T_Q on a serial Modbus line, AT on Modbus TCP; `one line` has both on one serial line, `dcon`
     on one DCON line with checksums, `map` both in the registers of one device. Y is always on a capaNCDT controller.
+
+    Where every device answers, a patient machine waits for each reply, however busy the computer is.
     """
 
     def __init__(
@@ -113,6 +135,7 @@ class WiredMachine:
         receiver: Receiver | None = None,
         sources: Mapping[str, Callable[[], float]] | None = None,
         timeout_s: float = TIMEOUT_S,
+        is_patient: bool = False,
         **changes: Any,
     ) -> None:
         self.world, self.name, self.layout, self.timeout_s = world, name, layout, timeout_s
@@ -127,7 +150,8 @@ class WiredMachine:
         #: Device and input of each channel.
         self._inputs = {"t_q_degc": ("couples", 0), "at_degc": ("cabinet", 0), "y_um": ("probe", 0)}
         self._build(rack)
-        self.fleet = drivers.build(self.lines, self.devices, source="test")
+        with patient_lines() if is_patient else contextlib.nullcontext():
+            self.fleet = drivers.build(self.lines, self.devices, source="test")
         self.config = self._config(changes)
         self.outcomes: list[Outcome] = []
         self.after: Callable[[Outcome], None] = lambda outcome: None

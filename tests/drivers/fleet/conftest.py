@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 
 import drivers
+from tests.service.shared_time import SharedTime
 
 
 def crc(data: bytes) -> bytes:
@@ -70,10 +71,15 @@ class Slave:
 
 Fault = Callable[[bytes], bytes | None]
 
-#: A device's time-out: long enough that one which answers is not late on a busy computer.
+#: A device's time-out, in the time of the loop: it stands still while anything works (`shared_time`).
 TIMEOUT_S = 0.5
-#: Time within which a read ends that has lost a reply, also on a busy computer; below the longest time-out.
+#: Time of the loop within which a read ends that has lost a reply; below the longest time-out.
 BOUND_S = 1.5
+
+
+def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Run drivers and ends on a time that stands still while either works: no reply is late on a busy computer."""
+    return {"shared time": lambda: SharedTime().new_loop()}
 
 
 class ModbusBus:
