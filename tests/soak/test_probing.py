@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,11 +47,12 @@ class Control:
         self.receiver = receiver
 
     def request(self, left_um: float = 1.0, **changes: Any) -> ProbeRequest:
-        """A probe of now that finds so much left."""
+        """A probe at the newest sample that finds so much left: of now there is no prediction on a busy computer."""
+        self.receiver.more(1)
         offset = self.receiver.messages[-1]
         usual = {
             "schema": 1,
-            "time_utc_ns": time.time_ns(),
+            "time_utc_ns": offset["time_utc_ns"],
             "axis": "y",
             "measured_um": left_um,
             "offset_applied_um": offset["y_offset_um"],
