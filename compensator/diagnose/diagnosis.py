@@ -38,7 +38,7 @@ from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
-from compensator.model.thermal_model import ThermalModel
+from compensator.model.thermal_model import LEAST_OWN_ERROR, ThermalModel
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
@@ -318,7 +318,8 @@ def _with_deviation(
         # What the base leaves is not what paths that are not deployed would.
         left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.
-    left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
+    late = late_variance_um2(extended) - late_variance_um2(model)
+    left = max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)
     if not deploys and left <= VERDICT_TIMES**2 * model.y_std_um**2 and model.y_std_um**2 <= VERDICT_TIMES**2 * left:
         return model
     return dataclasses.replace(extended, y_std_um=float(np.sqrt(left)), sha256="")

@@ -23,7 +23,7 @@ from compensator.identify.settings import Settings
 from compensator.identify.temperature import TemperatureFit, fit_temperature
 from compensator.model.engine import Engine
 from compensator.model.simulation import Scores, scores
-from compensator.model.thermal_model import PATH_UNITS, Estimator, Kind, Path, ThermalModel
+from compensator.model.thermal_model import LEAST_OWN_ERROR, PATH_UNITS, Estimator, Kind, Path, ThermalModel
 from compensator.progress import Progress, unreported
 
 #: Minimum noise assumed for a temperature, K: about a converter's step.
@@ -338,7 +338,7 @@ def _errors_um(deformation: DeformationFit, rms_um: float, noise_um: float, *, s
     if sparse:
         own_um = _own_error_um(deformation, rms_um, noise_um)
         return own_um, own_um
-    return float(np.sqrt(max(rms_um**2 - noise_um**2, (0.3 * noise_um) ** 2))), rms_um
+    return float(np.sqrt(max(rms_um**2 - noise_um**2, (LEAST_OWN_ERROR * noise_um) ** 2))), rms_um
 
 
 def _chips(runs: Sequence[Run], deformation: DeformationFit) -> list[Mask]:

@@ -37,6 +37,9 @@ PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
     "direct": {"DTF": "um/K", "TDTF": "um/K"},
 }
 
+#: The own error that a calibration or a diagnosis states (`y_std_um`) is at least this part of the noise of Y: with none
+#: the service would not watch the residual.
+LEAST_OWN_ERROR = 0.3
 #: A variance at most this many times its own rounding error is not determined.
 _ROUNDING = 100.0
 #: An inverse pole closer to −1 than this rings for more than about a dozen samples.

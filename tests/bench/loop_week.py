@@ -36,6 +36,8 @@ model.file = "model.toml"
 loss.predict_for_min = 30.0
 zero.rest_rate_um_per_min = 0.2
 guards.t_q_below_at_max_k = 2.0
+guards.suspect_jumps = true
+guards.jump_min_k = 1.0
 zenoh.prefix = "bench"
 recording.folder = "recordings"
 [limits]

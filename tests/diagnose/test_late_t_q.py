@@ -72,6 +72,8 @@ def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: flo
     assert total == pytest.approx(lag_min + delay_min, abs=0.6)
     assert "in real time" in effect.explanation
     assert removed(found, [late], []) > least
+    # Nothing is left beside what the engine states, and with no error of its own the residual would not be watched.
+    assert found.model.y_std_um == pytest.approx(0.09, rel=0.2)
     # What is promised is what the engine leaves, and not what could be known afterwards.
     [run] = runs_from(columns)
     left_um = np.sqrt(error(found.model, run, run.y_um))
