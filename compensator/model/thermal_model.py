@@ -37,7 +37,7 @@ PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
     "direct": {"DTF": "um/K", "TDTF": "um/K"},
 }
 
-#: The own error that a calibration or a diagnosis states (`y_std_um`) is at least this part of the noise of Y: with none
+#: What a calibration or a diagnosis states as own error (`y_std_um`) is at least this part of the noise of Y: with none
 #: the service would not watch the residual.
 LEAST_OWN_ERROR = 0.3
 #: A variance at most this many times its own rounding error is not determined.
