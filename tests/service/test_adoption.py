@@ -441,3 +441,14 @@ async def test_couples_that_a_person_has_put_right_are_no_fault_of_a_model_adopt
     assert "t_q_at_exchanged" in machine.outcomes[135].offset.reasons
     assert "t_q_at_exchanged" not in machine.outcomes[150].offset.reasons
     assert "t_q_at_exchanged" not in machine.outcomes[-1].offset.reasons
+
+
+@pytest.mark.parametrize(("error_um", "said"), [(b"0.0", True), (b"1.5", False)])
+async def test_a_model_that_states_no_error_ends_a_check_and_this_is_said(
+    tmp_path: Path, error_um: bytes, *, said: bool
+) -> None:
+    model = QUILL.replace(b"y_std_um = 2.3", b"y_std_um = " + error_um)
+    machine = Machine(tmp_path, settings(plausibility={"false_alarm_days": 30.0}))
+    machine.at_sample[200] = Asked(machine, "adopt", payload(model))
+    await machine.run(700, adopted(model))
+    assert ("are not compared any more" in machine.events("adopt")[-1].text) == said

@@ -161,6 +161,11 @@ class PlausibilityCheck:
         """Whether any check is on."""
         return self._watched or self._limits.t_q_below_at_after_min is not None or self._limits.rest is not None
 
+    @property
+    def watches_residual(self) -> bool:
+        """Whether measured Y is compared with the prediction: not for a model that states no error, for example."""
+        return self._watched
+
     def describe(self) -> str:
         """Describe which checks are on and off."""
         parts = []

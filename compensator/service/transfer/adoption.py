@@ -196,7 +196,7 @@ class Adoption:
         self._events.note(
             EventKind.ADOPT,
             f"model {named[0]} replaces {named[1]}, warm-up {candidate.minutes / 60.0:.1f} h, "
-            f"the offset moves by {difference:+.2f} µm; {described(comparison)}",
+            f"the offset moves by {difference:+.2f} µm; {described(comparison)}{_unwatched(new, old)}",
             {
                 "ok": True,
                 "action": order.action,
@@ -360,3 +360,10 @@ def _model_file(store: ModelStore, order: _Order) -> bytes:
     if order.action == CommandName.BACK:
         return store.before()
     return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
+
+
+def _unwatched(new: Compensation, old: Compensation) -> str:
+    """Return the remark that a check ends with a model that states no error."""
+    if new.plausibility.watches_residual or not old.plausibility.watches_residual:
+        return ""
+    return "; measured and predicted Y are not compared any more: the model states no error (y_std_um)"
