@@ -15,6 +15,8 @@ MIDNIGHT_NS = 1_767_571_200 * NS
 PERIOD_S, MINUTE_NS = 60.0, 60 * NS
 #: For so long after a fault of a temperature the state of the model is wrong, and after a zero the offset is limited.
 AFTER_FAULT_MIN, LIMITED_MIN = 360, 15
+#: Largest changes per minute that are permitted at least, °C; else twice those of the calibration (deploy/README.md).
+LEAST_RATES = {"t_q_degc": 5.0, "at_degc": 2.0}
 LOOP = '[loop]\npolicy = "adopt"\n'
 
 
@@ -24,7 +26,8 @@ def config_of(week, model):
     low, high = (
         {name: float(side(calibration[name])) for name in ("t_q_degc", "at_degc")} for side in (np.nanmin, np.nanmax)
     )
-    channels = "".join(_channel(name) for name in week.columns)
+    rates = {name: max(least, 2.0 * _fastest(calibration[name])) for name, least in LEAST_RATES.items()}
+    channels = "".join(_channel(name, rates) for name in week.columns)
     probe = ""
     if week.probes:
         probe = f"[probe]\nstd_um = {week.probe_std_um}\nmeasured_max_um = 100.0\nlargest_um = 60.0\n"
@@ -53,10 +56,16 @@ false_alarm_days = 30.0
     return parse_config(text.encode(), source=f"{week.family} {week.seed}")
 
 
-def _channel(name):
+def _fastest(column):
+    """Return the largest change per minute without single wrong readings."""
+    whole = np.median([column[:-2], column[1:-1], column[2:]], axis=0)
+    return float(np.nanmax(np.abs(np.diff(whole))))
+
+
+def _channel(name, rates):
     limits = {
-        "t_q_degc": "range = [0.0, 90.0]\nrate_max_per_min = 5.0\nstuck_after_min = 120.0\n",
-        "at_degc": "range = [0.0, 50.0]\nrate_max_per_min = 2.0\nstuck_after_min = 240.0\n",
+        "t_q_degc": f"range = [0.0, 90.0]\nrate_max_per_min = {rates['t_q_degc']}\nstuck_after_min = 120.0\n",
+        "at_degc": f"range = [0.0, 50.0]\nrate_max_per_min = {rates['at_degc']}\nstuck_after_min = 240.0\n",
         "y_um": "range = [-400.0, 400.0]\nrate_max_per_min = 30.0\nstuck_after_min = 60.0\n",
     }
     return f'[[channel]]\nname = "{name}"\ndevice = "simulated"\ninput = 0\n{limits.get(name, "")}'
