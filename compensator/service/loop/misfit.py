@@ -10,10 +10,11 @@ from compensator.service.loop.trust import is_alarmed
 from compensator.service.outcome import Outcome
 from compensator.service.probing import UNKNOWN_UM
 
-#: Probes that are judged together, and the sum of their squares that a right model exceeds once in a thousand times
-#: (chi-square of eight degrees of freedom). What each shows beyond the prediction is in its standard deviations.
-_TOGETHER, _UNEXPECTED = 8, 26.1
-#: No probe counts for more deviations: one chip is no misfit.
+#: Probes that are judged together, and the sum of the squares of all but the largest, which may be a chip, that a right
+#: model exceeds once in a thousand times (4 million simulated rows). What each shows beyond the prediction is in its
+#: standard deviations.
+_TOGETHER, _UNEXPECTED = 8, 16.7
+#: No probe counts for more deviations: two chips are no large misfit.
 _CLIP = 3.0
 #: Probes that are remembered. A correction by probes soon takes a misfit away, and does not explain it.
 _REMEMBERED = 24
@@ -34,5 +35,6 @@ def count_misfit(state: LoopState, present: Outcome, minutes: float) -> None:
 
 def _is_unexpected(shown: Sequence[float]) -> bool:
     """Return whether some probes in a row show more than a right model lets expect."""
-    rows = (shown[i : i + _TOGETHER] for i in range(len(shown) - _TOGETHER + 1))
-    return any(sum(each * each for each in row) > _UNEXPECTED for row in rows)
+    squares = [each * each for each in shown]
+    rows = (squares[i : i + _TOGETHER] for i in range(len(squares) - _TOGETHER + 1))
+    return any(sum(row) - max(row) > _UNEXPECTED for row in rows)
