@@ -136,6 +136,14 @@ def test_a_candidate_at_a_limit_is_not_adopted() -> None:
     assert next(decided(loop_of(place("a")), 8, never, {"a": limited})).hour > 371 / 60
 
 
+def test_a_candidate_that_leaves_a_limit_begins_to_count_anew() -> None:
+    def limited(minute: int) -> Sequence[str]:
+        return ("offset_limited",) if 200 <= minute < 260 and minute != 229 else ()
+
+    steps = [(one.step, one.why) for one in decided(loop_of(place("a")), 4.3, never, {"a": limited})]
+    assert ("end", "limits") not in steps
+
+
 @pytest.mark.parametrize(("hours", "may"), [(5.9, False), (6.1, True)])
 def test_a_model_stays_in_force_for_as_long_as_a_candidate_is_compared(hours: float, *, may: bool) -> None:
     found, now_ns = place("a"), BEGIN_NS + 20 * 3600 * NS
@@ -173,8 +181,11 @@ def test_probes_that_show_more_than_is_expected_are_a_misfit() -> None:
     assert probed(loop_of(), *quiet, *quiet, chip, *quiet, *quiet) == planned  # one chip is none
     # An effect shows in a few probes, and the correction by probes takes it away; then 3 h until a diagnosis.
     effect = [*quiet, *quiet, -6.0, 5.0, 4.0, -3.0, *quiet * 10]
-    hour, why = probed(loop_of(), *effect)[1]
+    (hour, why), *later = probed(loop_of(), *effect)[1:]
     assert why == "misfit" and 8.5 < hour < 12.5
+    # The last row that has one of the four ends with the 22nd probe, 24 are remembered, one comes each 40 min.
+    assert [hour for hour, why in later if why == "misfit" and hour > 38 * 40 / 60] == []
+    assert later
 
 
 def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> None:

@@ -91,7 +91,7 @@ def test_other_parameters_are_adopted_and_the_model_before_both_stays_the_way_ba
     night, ended = Night(shown(extended(1.0))), list[int]()
     loop, source = adopted(night, lambda i: float(not ended))
     night.found = [shown(extended())]
-    loop._core.state.adopted_utc_ns -= 24 * HOUR_NS  # no day between two adoptions
+    loop._core.state.adopted_utc_ns -= 24 * HOUR_NS  # an adoption is permitted at once
     steps = list[LoopStep]()
     for one in source:
         steps.append(loop.process(one))
@@ -118,6 +118,7 @@ def test_a_couple_that_drifts_while_both_are_compared_judges_neither_and_changes
     night.found = [shown(stronger(0.1))]
     while len(run(loop, source, 1)[0].candidates) < 2:
         pass
+    assert loop._core.state.adopted_utc_ns > 24 * HOUR_NS  # two adoptions are apart
     loop._core.state.adopted_utc_ns -= 24 * HOUR_NS  # an adoption would be permitted
     steps = run(loop, source, 90)
     began.append(steps[-1].outcome.sample.seq)

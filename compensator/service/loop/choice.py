@@ -81,8 +81,8 @@ class Choice:
     def _may_adopt(self, now_ns: int) -> bool:
         """Return whether the loop may adopt a model now.
 
-        Not before the present one has been in force for as long as a candidate is compared at least; and not while the
-        model before the last adoption is better so far: it would give its place to the present one.
+        Not before `shadow_h` have passed since the last adoption; and not while the model before it is better so far:
+        it would give its place to the present one.
         """
         state, since_ns = self._state, now_ns - self._state.adopted_utc_ns
         if self._settings.policy != "adopt":

@@ -43,7 +43,8 @@ from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN
 from compensator.service.transfer.second_opinion import described, is_unusable
 
-#: No decision before no sensor has been suspected for so long, min.
+#: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
+#: and a candidate ends that has been at a limit for so long, min.
 CLEAN_MIN = BLOCK_MIN
 _HOUR_NS = 3600 * NS
 
@@ -114,9 +115,10 @@ class Loop:
         minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
         forget_future(state, now_ns)
         suspected = contradicted or (bool(others) and all_suspect_a_sensor([present, *others.values()]))
-        state.usable_min = _counted(state.usable_min, present, minutes, suspected=contradicted)
+        state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
-        count_misfit(state, present, minutes)
+        record_ns = round(self._settings.record_h * _HOUR_NS)
+        count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         state.error.update(present)
         notes: list[Note] = []
         judged: list[Place] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from compensator.events import EventKind
 from compensator.messages import number
 from compensator.service.loop.state import LoopState
 from compensator.service.loop.trust import is_alarmed
@@ -20,16 +21,22 @@ _CLIP = 3.0
 _REMEMBERED = 24
 
 
-def count_misfit(state: LoopState, present: Outcome, minutes: float) -> None:
-    """Count a sample: the time of a misfit goes on while measured Y, or what probes have shown, is unexpected."""
+def count_misfit(state: LoopState, present: Outcome, minutes: float, *, oldest_ns: int) -> None:
+    """Count a sample: the time of a misfit goes on while measured Y, or what probes have shown, is unexpected.
+
+    Probes count that are about the last zero, and not older than the record that is diagnosed.
+    """
+    if any(note.kind == EventKind.ZERO for note in present.notes):
+        state.probes_shown = []
     shown = [
         max(-_CLIP, min(_CLIP, number(probe.innovation_um) / number(probe.innovation_std_um)))
         for probe in present.probes
         if number(probe.innovation_std_um) < UNKNOWN_UM
     ]
-    if shown:
-        state.probes_shown = [*state.probes_shown, *shown][-_REMEMBERED:]
-    is_misfit = is_alarmed(present.offset.reasons) or _is_unexpected(state.probes_shown)
+    now_ns = present.sample.time_utc_ns
+    kept = [one for one in state.probes_shown if one[0] >= oldest_ns]
+    state.probes_shown = [*kept, *((now_ns, one) for one in shown)][-_REMEMBERED:]
+    is_misfit = is_alarmed(present.offset.reasons) or _is_unexpected([one for _, one in state.probes_shown])
     state.misfit_min = state.misfit_min + minutes if is_misfit else 0.0
 
 

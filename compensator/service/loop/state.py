@@ -14,7 +14,7 @@ from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 2
+STATE_SCHEMA = 3
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
@@ -117,8 +117,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min : float
         For how long the model has been suspected, min.
-    probes_shown : list of float
-        What the last probes have shown beyond the prediction, standard deviations.
+    probes_shown : list of (int, float)
+        What the last probes since the zero have shown beyond the prediction, standard deviations, and when, ns since
+        1970 UTC.
     clean_min, usable_min : float
         For how long no sensor has been suspected, and no sensor has shown a fault by itself, as far as that is counted,
         min: decisions wait for the first, diagnoses for the second.
@@ -144,7 +145,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
-    probes_shown: list[float] = []
+    probes_shown: list[tuple[int, float]] = []
     clean_min: float = 0.0
     usable_min: float = 0.0
     found: list[Place] = []

@@ -4,9 +4,9 @@ Left out is what shows a fault by itself: a missing temperature, sensors that co
 held by hand or by an internal error.
 
 A residual alarm does not say whether a sensor or the model is wrong: to a check that knows one model, most effects that
-the model lacks look like a sensor that drifts. It is a reason to diagnose, which tells the two apart. Beside a shadow,
-a sensor counts as suspected only if it is under every model: a fault of a sensor stays under all of them, an effect
-that only one of them has does not.
+the model lacks look like a sensor that drifts. It is a reason to diagnose, which tells the two apart. Two models are
+compared unless a sensor is suspected under both, and nothing is decided while one is under every model: a fault of a
+sensor stays under all of them, an effect that only one of them has does not.
 """
 
 from __future__ import annotations
