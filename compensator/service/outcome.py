@@ -7,7 +7,7 @@ from msgspec import UNSET
 
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
-from compensator.events import Note
+from compensator.events import EventKind, Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Probe, Sample, number
 from compensator.messages_axes import AxesEstimate, AxisOffset
 from compensator.model.engine import Engine, Estimate
@@ -26,6 +26,11 @@ class Outcome(msgspec.Struct, frozen=True):
     notes: tuple[Note, ...]
     probes: tuple[Probe, ...] = ()
     further: tuple[AxisOffset, ...] = ()
+
+
+def sets_zero(outcome: Outcome) -> bool:
+    """Return whether a zero was set at a sample."""
+    return any(note.kind == EventKind.ZERO for note in outcome.notes)
 
 
 class Values(msgspec.Struct):

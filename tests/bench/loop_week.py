@@ -7,8 +7,8 @@ import numpy as np
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.demo.offline import sample_of
-from compensator.events import EventKind
 from compensator.messages import number
+from compensator.service.outcome import sets_zero
 
 #: 2026-01-05T00:00:00Z.
 MIDNIGHT_NS = 1_767_571_200 * NS
@@ -105,7 +105,7 @@ def error_of(outcomes, true_um):
     error, zero_um = np.full(true_um.size, math.nan), 0.0
     for outcome in outcomes:
         i = outcome.sample.seq
-        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+        if sets_zero(outcome):
             zero_um = true_um[i]
         error[i] = true_um[i] - zero_um + number(outcome.offset.y_offset_um)
     return error

@@ -14,8 +14,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
-from compensator.service.loop.choice import Choice
+from compensator.events import DiagnosisData
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Place, decode_loop
@@ -24,6 +23,7 @@ from compensator.service.outcome import Outcome
 #: A planned diagnosis is 8 h later.
 BEGIN_NS = 1_767_592_800 * NS
 SUSPECT = ("implausible:t_q_degc",)
+YEAR_MIN = 365 * 1440
 DEAD = ("channel_missing:coolant_degc",)
 Reasons = Callable[[int], Sequence[str]]
 
@@ -144,44 +144,37 @@ def test_a_candidate_that_leaves_a_limit_begins_to_count_anew() -> None:
     assert ("end", "limits") not in steps
 
 
-@pytest.mark.parametrize(("hours", "may"), [(5.9, False), (6.1, True)])
-def test_a_model_stays_in_force_for_as_long_as_a_candidate_is_compared(hours: float, *, may: bool) -> None:
-    found, now_ns = place("a"), BEGIN_NS + 20 * 3600 * NS
-    loop = loop_of(found)
-    loop.state.adopted_utc_ns = now_ns - round(hours * 3600) * NS
-    found.verdict = ComparisonData(
-        verdict=ComparisonVerdict.BETTER,
-        measured_by="sensor",
-        present_rms_um=5.0,
-        candidate_rms_um=1.0,
-        deviations=9.0,
-        ratio=0.3,
-    )
-    choice = Choice(loop.state, LoopSettings(policy="adopt"), loop.compared)
-    assert choice.adopted([found], now_ns) is (found if may else None)
-
-
-def probed(loop: Loop, *innovations_um: float, every: int = 40) -> list[tuple[float, str]]:
-    """Run a machine with probes alone; return the diagnoses that begin, and why."""
+def diagnosed(
+    loop: Loop, *innovations_um: float, every: int = 40, ahead: Callable[[int], int] = lambda _: 0
+) -> list[tuple[float, str]]:
+    """Run a day with probes alone, or without, by a clock that may be ahead, min; return the diagnoses that begin."""
     begun = []
     for minute in range(1, 1440):
         index, rest = divmod(minute, every)
-        shown = innovations_um[index % len(innovations_um)] if rest == 0 else None
-        present = outcome(minute, math.nan, math.nan, (), *([] if shown is None else [shown]))
-        begun += [(minute / 60.0, note.data["why"]) for note in loop.step(present, {})]
+        shown = [innovations_um[index % len(innovations_um)]] if innovations_um and rest == 0 else []
+        present = outcome(minute + ahead(minute), math.nan, math.nan, (), *shown)
+        notes = loop.step(present, {})
+        begun += [(minute / 60.0, note.data["why"]) for note in notes if note.data["step"] == "diagnose"]
         if loop.state.diagnosis is not None:
-            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), BEGIN_NS + minute * 60 * NS)
+            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), present.sample.time_utc_ns)
     return begun
+
+
+def test_a_clock_that_was_ahead_for_some_minutes_keeps_nothing_from_being_diagnosed() -> None:
+    loop = loop_of()
+    found = diagnosed(loop, ahead=lambda minute: YEAR_MIN if 100 <= minute < 110 else 0)
+    assert [why for hour, why in found if hour > 110 / 60] == ["planned", "planned"]
+    assert loop.state.diagnosed_utc_ns < BEGIN_NS + YEAR_MIN * 60 * NS
 
 
 def test_probes_that_show_more_than_is_expected_are_a_misfit() -> None:
     quiet, chip = [1.0, -1.6, 0.4, 1.9, -0.7], 40.0
     planned = [(8.0, "planned"), (20.0, "planned")]
-    assert probed(loop_of(), *quiet) == planned
-    assert probed(loop_of(), *quiet, *quiet, chip, *quiet, *quiet) == planned  # one chip is none
+    assert diagnosed(loop_of(), *quiet) == planned
+    assert diagnosed(loop_of(), *quiet, *quiet, chip, *quiet, *quiet) == planned  # one chip is none
     # An effect shows in a few probes, and the correction by probes takes it away; then 3 h until a diagnosis.
     effect = [*quiet, *quiet, -6.0, 5.0, 4.0, -3.0, *quiet * 10]
-    (hour, why), *later = probed(loop_of(), *effect)[1:]
+    (hour, why), *later = diagnosed(loop_of(), *effect)[1:]
     assert why == "misfit" and 8.5 < hour < 12.5
     # The last row that has one of the four ends with the 22nd probe, 24 are remembered, one comes each 40 min.
     assert [hour for hour, why in later if why == "misfit" and hour > 38 * 40 / 60] == []
@@ -190,7 +183,7 @@ def test_probes_that_show_more_than_is_expected_are_a_misfit() -> None:
 
 def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> None:
     loop = loop_of()
-    probed(loop, -6.0, 5.0)
+    diagnosed(loop, -6.0, 5.0)
     assert loop.state.misfit_min > 0.0 and decode_loop(msgspec.json.encode(loop.state)) == loop.state
     loop.model_changed(["gain:DTF"], BEGIN_NS + 1440 * 60 * NS)
     loop.step(outcome(1441, math.nan, math.nan, ()), {})

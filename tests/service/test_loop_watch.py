@@ -190,8 +190,11 @@ def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData,
     assert loop.state.phase == "shadow"
 
 
-def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() -> None:
-    better = ComparisonData(
+def may_adopt(loop: Loop, now_ns: int) -> bool:
+    """Return whether a candidate that is clearly better is adopted."""
+    loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
+    (found,) = loop.state.found
+    found.verdict = ComparisonData(
         verdict=ComparisonVerdict.BETTER,
         measured_by="sensor",
         present_rms_um=5.0,
@@ -199,13 +202,21 @@ def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far() ->
         deviations=9.0,
         ratio=0.3,
     )
-    for verdict, may in ((judged(ALIKE, 2.5, 0.8), False), (judged(ALIKE, 0.5, 1.0), True)):
-        loop, now_ns = watching(verdict)
-        loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
-        (found,) = loop.state.found
-        found.verdict = better
-        choice = Choice(loop.state, LoopSettings(policy="adopt"), loop.compared)
-        assert choice.adopted([found], now_ns) is (found if may else None)
+    chosen = Choice(loop.state, LoopSettings(policy="adopt"), loop.compared).adopted([found], now_ns)
+    assert chosen in (found, None)
+    return chosen is found
+
+
+@pytest.mark.parametrize(("verdict", "may"), [(judged(ALIKE, 2.5, 0.8), False), (judged(ALIKE, 0.5, 1.0), True)])
+def test_a_candidate_is_not_adopted_while_the_model_before_is_better_so_far(
+    verdict: ComparisonData, *, may: bool
+) -> None:
+    assert may_adopt(*watching(verdict)) == may
+
+
+@pytest.mark.parametrize(("hours", "may"), [(5.9, False), (6.1, True)])
+def test_between_two_adoptions_is_as_long_as_a_candidate_is_compared(hours: float, *, may: bool) -> None:
+    assert may_adopt(*watching(judged(ALIKE, 0.5, 1.0), hours=hours)) == may
 
 
 def test_a_candidate_neither_replaces_a_decided_exchange_nor_outlives_it() -> None:

@@ -8,7 +8,7 @@ from compensator.clock import NS
 from compensator.service.loop.state import Avoided, LoopState
 
 #: For how long effects are avoided when the service has gone back from them for the first time, h.
-FIRST_H = 24.0
+_FIRST_H = 24.0
 _HOUR_NS = 3600 * NS
 
 
@@ -27,7 +27,7 @@ def avoid_after_back(state: LoopState, effects: Sequence[str], now_ns: int, *, l
     """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
     oldest_ns = now_ns - round(longest_h * _HOUR_NS)
     state.avoided = [one for one in state.avoided if one.until_utc_ns > oldest_ns]
-    avoid(state, effects, now_ns, min(FIRST_H * 2 ** len(_alike(state, effects)), longest_h))
+    avoid(state, effects, now_ns, min(_FIRST_H * 2 ** len(_alike(state, effects)), longest_h))
 
 
 def _alike(state: LoopState, effects: Sequence[str]) -> list[Avoided]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict, EventKind
+from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
@@ -18,7 +18,7 @@ from compensator.service.loop.proof import (
 )
 from compensator.service.loop.state import Place
 from compensator.service.loop.trust import is_disturbed
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
 from compensator.service.transfer.comparison import Comparison
 from compensator.service.transfer.second_opinion import is_unusable
@@ -65,7 +65,7 @@ class Compared:
         """Add a sample, unless it must not judge; return whether the verdict was made anew."""
         self._place.error.update(other)
         found = self._comparison
-        if any(note.kind == EventKind.ZERO for note in present.notes):
+        if sets_zero(present):
             found.set_zero()
         reasons = [*present.offset.reasons, *other.offset.reasons]
         # A channel that only the model in force needs is no reason to stay with it.

@@ -47,7 +47,7 @@ def exchanged(
     incoming = state.place(state.incoming)
     assert incoming is not None
     before, state.effects, state.exchange, state.incoming = state.effects, incoming.effects, "", ""
-    state.model_changed()
+    state.forget_errors()
     state.remove(incoming)
     running, notes = state.diagnosis, list[Note]()
     if running is not None and running.candidate_sha256:

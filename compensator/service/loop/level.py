@@ -16,11 +16,10 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.events import EventKind
 from compensator.messages import number
 from compensator.service.loop.change import FEWEST, changed_at
 from compensator.service.loop.trust import is_disturbed
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN, BLOCK_NS
 from compensator.service.transfer.evidence import FLOOR_UM
 
@@ -54,7 +53,7 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
 
     def update(self, outcome: Outcome) -> None:
         """Add a sample of the model, unless it shows a fault by itself."""
-        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+        if sets_zero(outcome):
             self.clear()
         residual_um, block = number(outcome.estimate.residual_um), outcome.sample.time_utc_ns // BLOCK_NS
         if block != self.number:

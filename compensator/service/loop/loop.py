@@ -315,7 +315,7 @@ class Loop:
         if back:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
         state.effects = list(effects)
-        state.model_changed()
+        state.forget_errors()
         return self.give_up("by_hand", "a person has changed the model or the configuration")
 
     def give_up(self, why: str, text: str) -> list[Note]:

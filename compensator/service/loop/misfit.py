@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from compensator.events import EventKind
 from compensator.messages import number
 from compensator.service.loop.state import LoopState
 from compensator.service.loop.trust import is_alarmed
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.probing import UNKNOWN_UM
 
 #: Probes that are judged together, and the sum of the squares of all but the largest, which may be a chip, that a right
@@ -26,7 +25,7 @@ def count_misfit(state: LoopState, present: Outcome, minutes: float, *, oldest_n
 
     Probes count that are about the last zero, and not older than the record that is diagnosed.
     """
-    if any(note.kind == EventKind.ZERO for note in present.notes):
+    if sets_zero(present):
         state.probes_shown = []
     shown = [
         max(-_CLIP, min(_CLIP, number(probe.innovation_um) / number(probe.innovation_std_um)))

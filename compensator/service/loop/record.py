@@ -20,10 +20,9 @@ from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.data.table import Table
-from compensator.events import EventKind
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.service.loop.trust import is_contradicted, is_disturbed
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero
 
 #: Y is left out for so long before T_Q and AT contradict each other, h.
 BEFORE_H = 1.0
@@ -38,11 +37,7 @@ def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
         [(outcome.sample, outcome.offset) for outcome in record],
         [probe for outcome in record for probe in outcome.probes],
         name,
-        zeros_ns=[
-            outcome.sample.time_utc_ns
-            for outcome in record
-            if any(note.kind == EventKind.ZERO for note in outcome.notes)
-        ],
+        zeros_ns=[outcome.sample.time_utc_ns for outcome in record if sets_zero(outcome)],
     )
 
 

@@ -21,6 +21,7 @@ from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
+from compensator.service.outcome import sets_zero
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP
 
@@ -232,7 +233,7 @@ class LoopRun:
         self._record.append(outcome)
         if is_rest(outcome):
             self._at_rest, self._warm_ns = outcome, 0
-        elif any(note.kind == EventKind.ZERO for note in outcome.notes):
+        elif sets_zero(outcome):
             self._warm_ns = outcome.sample.time_utc_ns
         warm_up_h = WARM_UP * self._compensation.slowest_min / 60.0
         oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * 3600 * NS)

@@ -169,7 +169,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         self.watched = None if place is self.watched else self.watched
         self.found = [one for one in self.found if one is not place]
 
-    def model_changed(self) -> None:
+    def forget_errors(self) -> None:
         """Forget what was wrong with the model before."""
         self.error.clear()
         self.probes_shown = []
