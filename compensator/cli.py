@@ -198,7 +198,7 @@ def _have_streams() -> None:
 
 
 def _printed(text: str, code: int, *, for_people: bool = False) -> int:
-    """Print a result and return the exit code; it is that of a failure if nobody could read the result."""
+    """Print a result and return the exit code; that of a failure instead of 0 if it could not be written."""
     try:
         if for_people and sys.stdout.isatty():
             _show(wrapped(text, shutil.get_terminal_size().columns))
@@ -211,7 +211,7 @@ def _printed(text: str, code: int, *, for_people: bool = False) -> int:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
-        return 1
+        return code or 1
     return code
 
 
@@ -257,6 +257,13 @@ class _Parser(argparse.ArgumentParser):
         """Keep the words, so that an error can name an option that was mistyped."""
         self._words = sys.argv[1:] if args is None else args
         return super().parse_known_args(args, namespace)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print help or version; argparse itself would end with 0 where they could not be written."""
+        if file is not sys.stdout:
+            super()._print_message(message, file)
+        elif code := _printed(message.removesuffix("\n"), 0):
+            self.exit(code)
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""

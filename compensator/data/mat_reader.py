@@ -7,6 +7,7 @@ reads it. This one imports nothing of the project and writes what was read, or t
 from __future__ import annotations
 
 import pickle
+import resource
 import sys
 import warnings
 import zlib
@@ -14,9 +15,14 @@ import zlib
 #: What scipy raises for a damaged file besides its own error, and pandas for a damaged workbook.
 DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 
+#: Cells of the largest table, and the memory that reading one takes at most, bytes: a packed file of a few megabytes
+#: can ask for a thousand times as much.
+CELLS, MEMORY_BYTES = 50_000_000, 4_000_000_000
+
 
 def main() -> None:
     """Read the file that the argument names."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
@@ -26,7 +32,10 @@ def main() -> None:
         found = loadmat(sys.argv[1], squeeze_me=True, mat_dtype=False)
     except (NotImplementedError, MatReadError, *DAMAGED) as error:
         found = error
-    pickle.dump(found, sys.stdout.buffer)
+    data = pickle.dumps(found)
+    if len(data) > 8 * CELLS:
+        data = pickle.dumps(ValueError(f"more than {CELLS} values"))
+    sys.stdout.buffer.write(data)
 
 
 if __name__ == "__main__":

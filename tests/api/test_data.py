@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -199,6 +202,18 @@ def test_a_damaged_file_of_matlab_ends_its_reader_alone(tmp_path: Path, place: i
     path.write_bytes(data)
     with pytest.raises(tc.CompensatorError, match=r"not a MAT file that can be read \("):
         tc.read(path)
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"), [("CELLS = 99_999", "more than 99999 values"), ("MEMORY_BYTES = 2**20", "MemoryError")]
+)
+def test_a_packed_file_of_matlab_takes_bounded_memory(tmp_path: Path, limit: str, said: str) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, SMALL | {"zeros": np.zeros(100_000)}, do_compression=True)
+    assert path.stat().st_size < 2000
+    code = f"from compensator.data import mat_reader as m; import scipy.io.matlab; m.{limit}; m.main()"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=False)
+    assert said in (repr(pickle.loads(done.stdout)) if done.stdout else done.stderr.decode())
 
 
 def test_matrices_among_vectors_are_left_out_with_a_remark(tmp_path: Path) -> None:

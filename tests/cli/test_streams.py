@@ -45,8 +45,19 @@ def test_a_result_that_cannot_be_written_is_a_failure_in_one_line(rec: Path, opt
     done = ended(f"compensator replay {rec} {option} > /dev/full")
     assert done.returncode == 1
     assert done.stderr == "compensator: standard output: No space left on device\n"
+    for words in ("--help", "replay --help", "--version"):
+        done = ended(f"compensator {words} > /dev/full")
+        assert (done.returncode, done.stderr) == (1, "compensator: standard output: No space left on device\n")
     done = ended(f"compensator export {rec} --out /dev/full")
     assert (done.returncode, done.stderr) == (1, "compensator: /dev/full: No space left on device\n")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_an_audit_that_found_a_difference_says_so_even_where_it_cannot_be_written(rec: Path, tmp_path: Path) -> None:
+    changed = tmp_path / rec.name
+    changed.write_bytes(rec.read_bytes().replace(b'"ok"', b'"OK"'))
+    done = ended(f"compensator replay {changed} > /dev/full")
+    assert (done.returncode, done.stderr) == (3, "compensator: standard output: No space left on device\n")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])

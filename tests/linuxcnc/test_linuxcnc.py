@@ -33,14 +33,12 @@ def run_scenario(name: str, place: Path) -> subprocess.CompletedProcess[str]:
         folder = place / attempt
         folder.mkdir()
         folder.chmod(0o755)
-        done = subprocess.run(
-            [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(folder)],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=280,
-            check=False,
-        )
+        command = [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(folder)]
+        try:
+            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)
+        except subprocess.TimeoutExpired as error:
+            said = (error.stderr or b"").decode(errors="replace")
+            done = subprocess.CompletedProcess(command, 1, "", f"{said}\nnot done after {error.timeout:.0f} s")
         if done.returncode == 0 or not any(sign in done.stderr for sign in (f": {STARTS}", STARVED)):
             break
     return done
