@@ -119,7 +119,7 @@ async def test_the_service_on_mangled_wires_never_fails_and_never_jumps(tmp_path
     assert machine.events("error") == []
     offsets = [number(o.y_offset_um) for o in machine.offsets[20:]]
     assert all(abs(b - a) <= 8.0 + 1e-9 for a, b in itertools.pairwise(offsets))
-    assert {o.state for o in machine.offsets[-3:]} <= {"ok", "degraded"}
+    assert all(o.state in ("ok", "degraded") for o in machine.offsets[-3:]), machine.offsets[-50:]
 
 
 def payloads(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
