@@ -176,6 +176,12 @@ class Evidence:
             groups[smallest] = groups[smallest] | mask
         yield from groups
 
+    def samples_of_runs(self) -> list[slice]:
+        """Return where the samples of each run are."""
+        return list(
+            itertools.starmap(slice, itertools.pairwise(np.cumsum([0, *[s.size for s in self.signals]]).tolist()))
+        )
+
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
@@ -219,8 +225,6 @@ class Evidence:
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
-        A run of which no sample is used has its zero from its own mean.
-
         Parameters
         ----------
         raw, effects : numpy.ndarray, shape (n,)
@@ -231,14 +235,7 @@ class Evidence:
         open_ = raw - effects
         table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
-        left = np.asarray(open_ - table @ coefficients)
-        measured, first = np.isfinite(self.y_um), 0
-        for record in self.signals:
-            own = slice(first, first + record.size)
-            if not self.used[own].any() and measured[own].any():
-                left[own] -= left[own][measured[own]].mean()
-            first += record.size
-        return left
+        return np.asarray(open_ - table @ coefficients)
 
 
 def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:

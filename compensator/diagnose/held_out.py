@@ -8,13 +8,16 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Indices, Vector
+from compensator.arrays import Indices, Mask, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
+from compensator.diagnose.likelihood import RandomColumns
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
 from compensator.diagnose.own_error import own_error_alone
+from compensator.diagnose.points import ZERO_TIMES, Points, Rest
 from compensator.diagnose.scan import Grid
+from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.hypothesis import Place
 from compensator.progress import ExecutorMap, Progress
 
@@ -53,7 +56,7 @@ class HeldOut:
 
 
 def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> HeldOut:
-    """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
+    """Repeat the search without each block, and predict it by what that finds."""
     evidence = found.search.evidence
     blocks = list(evidence.blocks(FOLDS))
     progress(1, len(blocks) + 1)
@@ -70,20 +73,21 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
             unobserved=unobserved,
             grid=grid,
             foresight=found.foresight,
+            of_time=not_deployed(found)[1],
+            rests=(found.selection.fit.rest, found.selection.before.rest),
         ),
         views,
     )
-    base = by_base(evidence) + not_deployed(found)[1]
-    left = np.full((2, 5 + len(places), evidence.used.size), np.nan)
+    left = np.full((7 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
         progress(done, len(blocks) + 1)
         searches += several.has
-        for choice in (0, 1):
-            for i, one in enumerate((base, *several.added)):
-                left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
-    best = min((0, 1), key=lambda choice: rms_of(left[choice, 1]))
-    base, nothing, named, whole, ceiling, *steps = left[best]
+        for i, one in enumerate(several.predicted):
+            left[i, block] = left_of_block(evidence, block, seen, one)
+    # Nothing is given the better of both: a rest without effects may be that of the effects, and go anywhere.
+    base, nothing = min(left[:2], left[2:4], key=lambda each: rms_of(each[1]))
+    named, whole, ceiling, *steps = left[4:]
     return HeldOut(
         base=base,
         nothing=nothing,
@@ -95,19 +99,30 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     )
 
 
+def left_of_block(evidence: Evidence, block: Mask, seen: Evidence, predicted: Vector) -> Vector:
+    """Return what a prediction leaves of a block, µm; a run of which nothing was seen is about its own mean."""
+    left = np.where(block, evidence.residual - predicted, np.nan)
+    for run in evidence.samples_of_runs():
+        if block[run].any() and not seen.used[run].any():
+            left[run] -= np.nanmean(left[run])
+    return np.asarray(left[block])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Predictions:
     """What a search in a part of the evidence predicts on every sample of all.
 
     Parameters
     ----------
-    added : tuple of numpy.ndarray, shape (n,)
-        Of nothing, the named effects, effects and remainder, all channels; of the first place, the first two, …, µm.
+    predicted : tuple of numpy.ndarray, shape (n,)
+        Of the base's paths as they are and nothing, with the rest without effects; both again, the named effects,
+        effects and remainder, all channels, the first place, the first two, …, with the rest beside effects; µm, each
+        with the zeros and initial states that are most probable beside it.
     has : numpy.ndarray of int, shape (places,)
         1 where it found an effect of that place.
     """
 
-    added: tuple[Vector, ...]
+    predicted: tuple[Vector, ...]
     has: Indices
 
 
@@ -119,6 +134,8 @@ def _predictions(
     unobserved: bool,
     grid: Grid | None,
     foresight: Foresight | None,
+    of_time: Vector,
+    rests: tuple[Rest, Rest],
 ) -> _Predictions:
     found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight)
     steps, total = [], found.own_paths
@@ -133,7 +150,36 @@ def _predictions(
     if own_alone:
         own = found.remainder if found.is_own_error_alone else None
         whole = (own or own_error_alone(found.selection.before)).added
-    return _Predictions(added=(found.paths, found.named, whole, found.ceiling, *steps), has=has)
+    beside, alone = (_Nuisances(found.search.points, rest).beside for rest in rests)
+    nothing = by_base(seen) + of_time, found.paths
+    added = (found.named, whole, found.ceiling, *steps)
+    return _Predictions(predicted=(*map(alone, nothing), *map(beside, (*nothing, *added))), has=has)
+
+
+class _Nuisances:
+    """Zeros and initial states of all runs as a part of the evidence knows them.
+
+    Parameters
+    ----------
+    points : Points
+        The part.
+    rest : Rest
+        What no effect explains, of all data: how far initial states are from rest, and how many samples count. A part
+        that does not see where a run begins says nothing of that.
+    """
+
+    def __init__(self, points: Points, rest: Rest) -> None:
+        self._points, self._whitening = points, Whitening(points, rest)
+        table, is_zero = points.evidence.nuisances, points.is_zero
+        zero_um = ZERO_TIMES * points.spread_um
+        self._table = np.concatenate([zero_um * table[:, is_zero], rest.start_um * table[:, ~is_zero]], axis=1)
+        self._white = self._whitening.of(self._points.averaged(self._table))
+
+    def beside(self, added: Vector) -> Vector:
+        """Return what effects add, with the most probable zeros and initial states beside them, on every sample."""
+        target = self._points.residual - self._points.averaged(added[:, None])[:, 0]
+        weights = RandomColumns(self._white, self._whitening.of(target[:, None])[:, 0]).mean
+        return np.asarray(added + self._table @ weights)
 
 
 def how_held_out(evidence: Evidence) -> str:

@@ -9,6 +9,7 @@ import compensator as tc
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
+from compensator.diagnose.held_out import left_of_block
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
@@ -48,10 +49,20 @@ def test_a_recording_does_not_foretell_itself():
     disturbed = dataclasses.replace(evidence, residual=np.where(mask, 3.0 * evidence.residual, evidence.residual))
     assert findings_of(disturbed.without(mask)).whole == pytest.approx(predicted, abs=1e-9)
     # Its zero is its own mean, and no shift of it counts.
-    seen = evidence.without(mask)
-    left = seen.left(evidence.residual + 50.0 * mask, predicted, at_rest=False)
-    assert left == pytest.approx(seen.left(evidence.residual, predicted, at_rest=False), abs=1e-6)
-    assert abs(left[mask].mean()) < 1e-6
+    shifted = dataclasses.replace(evidence, residual=evidence.residual + 50.0 * mask)
+    left, other = (left_of_block(each, mask, evidence.without(mask), predicted) for each in (evidence, shifted))
+    assert left == pytest.approx(other, abs=1e-6) and abs(left.mean()) < 1e-6
+
+
+def test_a_block_behind_a_gap_is_foretold_by_what_is_known_of_the_state_there():
+    """Two hours of the run behind the gap are seen: its slow modes are not, and are expected to be near rest."""
+    columns, _, _ = record([draw("input", 3)], 80, 36.0)
+    gap = slice(1252, 1366)
+    for name in ("t_q_degc", "at_degc"):
+        columns[name][gap] = np.nan
+    found = diagnose(QUILL, runs_from(columns))
+    assert [effect.place for effect in found.effects] == [("input", "", "spindle_rpm")]
+    assert found.verdict == "explained" and found.after.rms_um < 0.6 * found.before.rms_um
 
 
 def test_the_diagnosis_says_how_it_was_measured():

@@ -17,6 +17,7 @@ from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
+from compensator.diagnose.points import Points
 from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
 from compensator.display import text_of_all
 from compensator.model.model_file import load_model
@@ -140,6 +141,7 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
         count = 2 if seen.used[:200].all() else 1
         assert seen.used.sum() < evidence.used.sum()
         return SimpleNamespace(
+            search=SimpleNamespace(points=Points(seen)),
             terms=terms[:count],
             responses=[large, small][:count],
             own_paths=nothing,
@@ -152,8 +154,16 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
 
     monkeypatch.setattr(held_out_module, "findings_of", findings_of)
     search = SimpleNamespace(evidence=evidence, grid=None)
+    rest = dataclasses.replace(Points(evidence).typical_rest(), noise_um=1.0, slow_um=0.01, start_um=0.01)
+    fit = SimpleNamespace(rest=rest)
     all_of = SimpleNamespace(
-        search=search, terms=(), responses=(), explains=True, foresight=None, is_own_error_alone=False
+        search=search,
+        selection=SimpleNamespace(fit=fit, before=fit),
+        terms=(),
+        responses=(),
+        explains=True,
+        foresight=None,
+        is_own_error_alone=False,
     )
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
