@@ -12,16 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Mask
 from compensator.diagnose.findings import Findings, by_channels, in_free_run
 from compensator.diagnose.fit import late_term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.held_out import HeldOut
-from compensator.diagnose.outcome import FOLDS, rms_of
+from compensator.diagnose.outcome import rms_of
 
-#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor, or the data that were
-#: searched are in free run. Where the base's paths are fitted anew each block knows less of them than the whole.
-CONTRADICTS, CONTRADICTS_ANEW = 1.25, 2.5
+#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor. It is not near 1:
+#: each block may hold an event of its own, and the others then know less of an effect, and may name it otherwise.
+CONTRADICTS = 2.5
+#: Nor where the data that were searched are predicted worse with it in free run by more than this factor.
+WORSE = 1.25
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
 #: The same of many values in two cases. Beside a late T_Q a remainder is for the minutes that a dead time hides: they
@@ -90,12 +91,11 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
     """
     found, effects, held_out = _with_remainder_that_helps(found, effects, held_out)
     found, effects, held_out = _by_channels(found, effects, held_out)
-    found, held_out = _by_names_alone(found, held_out)
     decided = Deployment(
         found=found,
         effects=effects,
         held_out=held_out,
-        contradicted=_is_contradicted(found, held_out, _foretold(found)),
+        contradicted=_is_contradicted(found, held_out),
         worse_um=_worse_in_free_run(found),
     )
     return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
@@ -176,49 +176,15 @@ def _by_channels(
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
 
 
-def _by_names_alone(found: Findings, held_out: HeldOut) -> tuple[Findings, HeldOut]:
-    """Deploy names without a remainder where held-out blocks contradict only what else searches without a block named.
-
-    Which name a part of the data gets is less certain than what the effect does: a fan that schedules a path is an
-    input in one of three parts. The other name is not deployed, and says nothing of the one that is.
-    """
-    alone = dataclasses.replace(held_out, named=held_out.places, whole=held_out.places)
-    judged = found.terms and found.explains and not found.search.evidence.free_paths
-    if not judged or not _is_contradicted(found, held_out) or _is_contradicted(found, alone, _foretold(found)):
-        return found, held_out
-    return dataclasses.replace(found, remainder=None, belongs=False), alone
-
-
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
     """Return effects in whose place no remainder is deployed."""
     return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
 
 
-def _is_contradicted(found: Findings, held_out: HeldOut, *also: Mask) -> bool:
-    """Return whether held-out blocks contradict what was found; few values do not decide that.
-
-    Where every block holds an event of its own, none foretells another: only a clear contradiction counts, by all
-    samples and by those of the further masks.
-    """
-    evidence = found.search.evidence
-    factor = CONTRADICTS_ANEW if evidence.free_paths else CONTRADICTS
-    masks = (np.ones(evidence.used.size, dtype=bool), *also)
-    return not evidence.is_sparse and all(
-        rms_of(held_out.whole[mask]) > factor * rms_of(held_out.nothing[mask]) for mask in masks
-    )
-
-
-def _foretold(found: Findings) -> Mask:
-    """Return the samples of the blocks that the others can foretell, with what was found.
-
-    An effect that counts from rest needs how warm the machine began, which only the block that begins it shows.
-    """
-    evidence = found.search.evidence
-    foretold = np.ones(evidence.used.size, dtype=bool)
-    counts_from_rest = any(term.effect.counts_from_rest and term.effect.path == "DTF" for term in found.terms)
-    if counts_from_rest and evidence.start_k and not (evidence.holds_out_recordings or evidence.is_sparse):
-        foretold &= ~next(evidence.blocks(FOLDS))
-    return foretold
+def _is_contradicted(found: Findings, held_out: HeldOut) -> bool:
+    """Return whether held-out blocks contradict what was found; few values do not decide that."""
+    is_sparse = found.search.evidence.is_sparse
+    return not is_sparse and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
 
 
 def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
@@ -229,5 +195,5 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     """
     base_um, own_um = in_free_run(found)
     is_late = found.explains and late_term(found.selection.fit) is not None
-    is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else CONTRADICTS) * base_um
+    is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else WORSE) * base_um
     return (base_um, own_um) if is_worse else None

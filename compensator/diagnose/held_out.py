@@ -42,14 +42,12 @@ WITH_PATHS = "; before: the paths of the first model alone, also refitted to the
 class HeldOut:
     """What is left on every sample by estimates that did not see it, µm; NaN where y is missing.
 
-    `base` is left by the base's paths as they are, of which the other blocks set the zero and initial state only;
-    `places` by effects of the places that were found in all data, and nothing else that a search named.
+    `base` is left by the base's paths as they are, of which the other blocks set the zero and initial state only.
     """
 
     base: Vector
     nothing: Vector
     named: Vector
-    places: Vector
     whole: Vector
     ceiling: Vector
     steps: tuple[Step, ...]
@@ -92,7 +90,6 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
         base=base,
         nothing=nothing,
         named=named,
-        places=steps[-1] if steps else named,
         whole=whole,
         ceiling=ceiling,
         steps=tuple(Step(rms_um=rms_of(s), searches=n) for s, n in zip(steps, searches.tolist(), strict=True)),

@@ -156,9 +156,6 @@ def record(scenarios, seed, hours=36.0, *, noise_k=0.02, noise_um=0.3):
     return measured, true, effect
 
 
-def held_out_errors(
-    nothing: np.ndarray, *, named: np.ndarray, whole: np.ndarray, ceiling: np.ndarray, places: np.ndarray | None = None
-) -> HeldOut:
-    """Errors on held-out blocks that are made up: the base is as it was, and the searches without a block agree."""
-    places = named if places is None else places
-    return HeldOut(base=nothing, nothing=nothing, named=named, places=places, whole=whole, ceiling=ceiling, steps=())
+def held_out_errors(nothing: np.ndarray, *, named: np.ndarray, whole: np.ndarray, ceiling: np.ndarray) -> HeldOut:
+    """Errors on held-out blocks that are made up: the base is as it was."""
+    return HeldOut(base=nothing, nothing=nothing, named=named, whole=whole, ceiling=ceiling, steps=())

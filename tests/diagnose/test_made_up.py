@@ -13,7 +13,7 @@ import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import findings as module
-from compensator.diagnose.deployment import _by_channels, _by_names_alone, _foretold, _is_contradicted
+from compensator.diagnose.deployment import _by_channels
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
 from compensator.diagnose.outcome import warnings_of
@@ -155,54 +155,13 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
     assert judged.whole[0] == (channels_um if is_confirmed else named_um)
 
 
-@pytest.mark.parametrize(
-    ("whole_um", "places_um", "is_alone"), [(2.0, 1.0, True), (2.0, 1.4, False), (1.1, 1.0, False)]
-)
-def test_what_other_searches_name_does_not_speak_against_a_name(
-    called_late: Findings, whole_um: float, places_um: float, is_alone: bool
-) -> None:
-    ones = np.ones(called_late.ceiling.size)
-    whole = whole_um * ones
-    held_out = held_out_errors(ones, named=whole, places=places_um * ones, whole=whole, ceiling=ones)
-    beside = dataclasses.replace(called_late, remainder=called_late.channels, explains=True)
-    found, judged = _by_names_alone(beside, held_out)
-    assert (found.remainder is None) is is_alone and found.terms == called_late.terms
-    assert judged.whole[0] == judged.named[0] == (places_um if is_alone else whole_um)
-
-
-@pytest.mark.parametrize(
-    ("start_k", "counts_from_rest", "others", "contradicted"),
-    [(23.0, True, 0.5, False), (0.0, True, 0.5, True), (23.0, False, 0.5, True), (23.0, True, 2.0, True)],
-)
-def test_what_counts_from_rest_is_not_judged_by_the_block_that_begins_warm(
-    start_k: float, counts_from_rest: bool, others: float, contradicted: bool
-) -> None:
-    """How warm a machine began no other block shows."""
-    first = np.repeat([True, False, False], 100)
-    evidence = SimpleNamespace(
-        used=np.ones(300, dtype=bool),
-        start_k=start_k,
-        is_sparse=False,
-        free_paths=False,
-        holds_out_recordings=False,
-        blocks=lambda count: iter([first]),
-    )
-    effect = SimpleNamespace(counts_from_rest=counts_from_rest, path="DTF")
-    found: Any = SimpleNamespace(search=SimpleNamespace(evidence=evidence), terms=[SimpleNamespace(effect=effect)])
-    ones = np.ones(300)
-    whole = np.where(first, 4.0, others)
-    held_out = held_out_errors(ones, named=whole, places=whole, whole=whole, ceiling=ones)
-    assert _is_contradicted(found, held_out, _foretold(found)) is contradicted
-    assert _is_contradicted(found, held_out)
-
-
 def test_a_name_that_no_part_of_a_record_shows_is_deployed_and_not_called_confirmed() -> None:
     """The floor in 16 h: a search without a block gives it another name, and predicts that block far worse."""
     machine = next(c for c in _cases(270_000) if (c.family, c.seed) == ("lumped", 270_020)).draw()
     base = tc.identify(machine.calibration.columns).model
     why = tc.diagnose(base, machine.record.columns)
     assert ("input", "floor_degc") in [(effect.kind, effect.place[2]) for effect in why.effects]
-    assert why.diagnosis.after.rms_um == why.diagnosis.before.rms_um and why.verdict == "partly_explained"
+    assert why.diagnosis.after.rms_um > why.diagnosis.before.rms_um and why.verdict == "partly_explained"
     assert ModelWarning.NOT_CONFIRMED in [remark.code for remark in why.diagnosis.warnings]
     before_um, after_um = (
         np.std(machine.fresh.true_um - tc.simulate(model, machine.fresh.columns)["y_pred_um"])
