@@ -32,7 +32,9 @@ from tests.service.jumping import (
     readings,
     run,
     settings,
+    undisturbed,
     working_day,
+    zero_at,
 )
 from tests.service.records import QUILL, direct, sample
 from tests.service.simulated import config
@@ -51,9 +53,8 @@ def day() -> dict[str, np.ndarray]:
 def test_a_jump_is_never_ok_and_its_mend_makes_the_offset_right_at_once(
     day: dict[str, np.ndarray], channel: str, size: float
 ) -> None:
-    healthy = offsets(run(day))
     outcomes = run(day, biased(channel, size))
-    wrong = np.abs(offsets(outcomes) - healthy) > 3.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 3.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
     during = outcomes[BEGIN + 4 : END]
     assert all(f"suspect_channel:{channel}" in o.offset.reasons for o in during)
@@ -77,7 +78,7 @@ def test_a_couple_that_is_pushed_in_halfway_is_never_ok_while_it_is_wrong(
         values[channel] += size if BEGIN <= i < END else part * size * (i >= END)
 
     outcomes = run(day, change)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
     assert events(outcomes, "jumped") == [BEGIN, END + 2][: 2 if part < 0.2 else 1]
     assert outcomes[END + 30].offset.state == "hold" and not events(outcomes, "accepted")
@@ -95,7 +96,7 @@ def test_air_that_moves_while_t_q_does_not_is_used_and_its_deviation_says_so(
             values["at_degc"] += size * min((i - BEGIN + 1) / samples, 1.0)
 
     outcomes = run(day, change)
-    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    apart = np.abs(offsets(outcomes) - undisturbed())
     during = outcomes[BEGIN:end]
     assert all("unconfirmed_channel:at_degc" in o.offset.reasons for o in during)
     assert not any("suspect_channel:at_degc" in o.offset.reasons for o in during)
@@ -180,7 +181,7 @@ def test_a_jump_beside_another_one_is_never_ok_while_it_is_wrong(
     day: dict[str, np.ndarray], change: Change, ends: str
 ) -> None:
     outcomes = run(day, change)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes[: BEGIN + 300]) if i > BEGIN + 1)
     assert outcomes[BEGIN + 250].offset.state == ends
 
@@ -215,8 +216,7 @@ def test_a_new_zero_counts_for_both_channels_that_are_suspect(day: dict[str, np.
 
     reasons = {r for o in run(day, change)[END - 1 : END] for r in o.offset.reasons}
     outcomes = run(day, change, zero)
-    healthy = offsets(run(day, act=lambda i, c: c.zero("warm") if i == END else None))
-    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 30 : END + 120]) < 1.0
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=END))[END + 30 : END + 120]) < 1.0
     assert {o.offset.state for o in outcomes[END + 30 : END + 120]} == {"ok"}
 
 
@@ -232,22 +232,18 @@ def test_a_zero_on_a_warm_machine_is_right_whichever_answer_of_an_unconfirmed_ch
         if BEGIN - unseen <= i < BEGIN:
             values[channel] = math.nan
 
-    def zero(i: int, compensation: Compensation) -> None:
-        if i == BEGIN + 60:
-            compensation.zero("warm")
-
-    outcomes, healthy = run(day, change, zero), offsets(run(day, act=zero))
+    outcomes = run(day, change, zero_at(BEGIN + 60))
     stds = np.array([number(o.offset.y_offset_std_um) for o in outcomes])
     assert f"unconfirmed_channel:{channel}" in outcomes[BEGIN + 60].offset.reasons
     # What both answers differ by is counted from the zero.
-    apart = np.abs(offsets(outcomes) - healthy)
+    apart = np.abs(offsets(outcomes) - undisturbed(zero=BEGIN + 60))
     assert stds[BEGIN + 59] > 10.0 and stds[BEGIN + 60] < 2.5
     assert np.all(apart[BEGIN + 66 : END] < 2.0 * stds[BEGIN + 66 : END])
     assert np.max(apart[BEGIN:END]) > 5.0 and np.max(apart[END + 12 : END + 200]) < 1.0
 
 
 def test_a_jump_that_is_only_watched_is_so_after_a_zero_on_a_warm_machine(day: dict[str, np.ndarray]) -> None:
-    outcomes = run(day, biased("t_q_degc", 4.0), lambda i, c: c.zero("warm") if i == BEGIN + 1 else None)
+    outcomes = run(day, biased("t_q_degc", 4.0), zero_at(BEGIN + 1))
     assert events(outcomes, "jumped") == [BEGIN + 1]
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 2 : END])
 
@@ -271,7 +267,7 @@ def test_what_is_left_of_a_jump_that_was_within_the_permitted_rate_is_not_believ
         values["at_degc"] += 8.0 if BEGIN <= i < END else 1.5 * (i >= END)
 
     outcomes = run(day, change, channel=channels)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
 
 
@@ -289,7 +285,7 @@ def test_a_jump_that_takes_three_samples_is_one_jump(day: dict[str, np.ndarray],
             values["t_q_degc"] += size * min((i - BEGIN + 1) / 3.0, 1.0)
 
     outcomes = run(day, change)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     # Noticed in the sample after its end.
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 3 : END])
     assert {round(data["shift_k"]) for o in outcomes for _, _, data in o.notes if data.get("code") == "jumped"} == {
@@ -471,15 +467,15 @@ def test_an_operator_decides(day: dict[str, np.ndarray], how: str) -> None:
         if i == BEGIN + 60:
             compensation.resume() if how == "resume" else compensation.zero("warm")
 
-    healthy, outcomes = run(day), run(day, biased("t_q_degc", 6.0, end=10_000), act)
+    outcomes = run(day, biased("t_q_degc", 6.0, end=10_000), act)
     assert outcomes[BEGIN + 59].offset.state == "hold"
     assert {o.offset.state for o in outcomes[BEGIN + 90 :]} == {"ok"}
     grown = offsets(outcomes)[-1] - offsets(outcomes)[BEGIN + 100]
-    right = offsets(healthy)[-1] - offsets(healthy)[BEGIN + 100]
+    right = undisturbed()[-1] - undisturbed()[BEGIN + 100]
     if how == "zero":
         assert abs(grown - right) < 1.5
     else:
-        assert abs(offsets(outcomes)[-1] - offsets(healthy)[-1]) > 10.0  # 6 K too warm, as the operator said
+        assert abs(offsets(outcomes)[-1] - undisturbed()[-1]) > 10.0  # 6 K too warm, as the operator said
 
 
 def test_another_zero_of_a_sensor_is_recorded_and_known_to_what_begins_from_the_record(
@@ -559,7 +555,7 @@ def test_a_loose_contact_must_be_back_for_longer_each_time(day: dict[str, np.nda
     outcomes = run(day, loose)
     backs = [i for i in events(outcomes, "accepted") if i < END]
     assert len(backs) < (END - BEGIN) // 16 // 2
-    wrong = np.abs(offsets(outcomes) - offsets(run(day))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
 
 
@@ -582,7 +578,7 @@ def test_a_loose_contact_that_comes_to_rest_is_used_again_and_unconfirmed(
     day: dict[str, np.ndarray], channel: str, size: float
 ) -> None:
     begin, end = 200, 400
-    apart = np.abs(offsets(run(day)) - offsets(outcomes := run(day, loose(channel, size, begin, end))))
+    apart = np.abs(undisturbed() - offsets(outcomes := run(day, loose(channel, size, begin, end))))
     states = np.array([str(o.offset.state) for o in outcomes])
     assert not np.any((apart > 5.0) & (states == "ok"))
     # It must have been at rest for as long as it would have to be back.
@@ -632,7 +628,7 @@ def test_a_deviation_contains_what_a_wrong_rest_did_after_a_further_jump_too(
         values["t_q_degc"] += size if 300 <= i < mend else 0.0
 
     outcomes = run(day, change)
-    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    apart = np.abs(offsets(outcomes) - undisturbed())
     used = [i for i in events(outcomes, "unconfirmed") if 230 <= i < mend]
     assert used and apart[mend - 1] > 10.0
     assert "ok" not in {o.offset.state for o in outcomes[used[0] :]}
@@ -654,7 +650,7 @@ def test_a_loose_contact_of_the_air_that_rests_where_no_air_can_be_is_not_used(
             values["at_degc"] += size * (0.15 if i >= 300 and (i // 6) % 2 == 0 else by)
 
     outcomes = run(day, change)
-    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    apart = np.abs(offsets(outcomes) - undisturbed())
     states = [str(o.offset.state) for o in outcomes]
     assert set(states[230:600]) == {"hold"} and not any(i < 600 for i in events(outcomes, "unconfirmed"))
     assert not any(far > 5.0 and state == "ok" for far, state in zip(apart, states, strict=True))

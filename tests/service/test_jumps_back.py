@@ -34,7 +34,7 @@ def test_what_is_left_of_a_jump_is_where_the_channel_comes_to_rest(
     """One sample on the way is not the rest: a couple that is pushed in slowly."""
     way = [(BEGIN + 30 + i, name, k) for i, k in enumerate((*on_the_way, rest))]
     outcomes = run(day, steps((BEGIN, name, size), *way))
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     asked = {f"suspect_channel:{name}", f"unconfirmed_channel:{name}"}
     assert all(asked & set(map(str, o.offset.reasons)) for o in outcomes[BEGIN:END])
 
@@ -46,7 +46,7 @@ def test_one_wrong_sample_after_some_without_the_channel_is_forgotten(
 ) -> None:
     outcomes = run(day, steps((BEGIN, name, math.nan), (BEGIN + 3, name, size), (BEGIN + 4, name, 0.0)))
     assert f"unconfirmed_channel:{name}" in outcomes[BEGIN + 3].offset.reasons
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     asked = {f"suspect_channel:{name}", f"unconfirmed_channel:{name}"}
     assert not any(asked & set(map(str, o.offset.reasons)) for o in outcomes[LATER:])
 
@@ -65,7 +65,7 @@ def test_a_door_does_not_hide_a_jump_of_t_q_that_nobody_saw(
             (begin + 8, "at_degc", 0.0),
         ),
     )
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     asked = {"suspect_channel:t_q_degc", "unconfirmed_channel:t_q_degc"}
     assert all(asked & set(map(str, o.offset.reasons)) for o in outcomes[begin + 7 : END])
 

@@ -27,7 +27,9 @@ from tests.service.jumping import (
     run,
     settings,
     steps,
+    undisturbed,
     working_day,
+    zero_at,
 )
 from tests.service.records import QUILL, sample
 
@@ -39,10 +41,6 @@ def day() -> dict[str, np.ndarray]:
     return working_day()
 
 
-def zero_at(sample_number: int) -> Callable[[int, Compensation], None]:
-    return lambda i, compensation: compensation.zero("warm") if i == sample_number else None
-
-
 def test_at_that_is_back_before_t_q_leaves_t_q_in_question(day: dict[str, np.ndarray]) -> None:
     """AT comes back little by little, to where it was held; T_Q has jumped meanwhile, and stays."""
 
@@ -52,7 +50,7 @@ def test_at_that_is_back_before_t_q_leaves_t_q_in_question(day: dict[str, np.nda
         values["t_q_degc"] -= 4.5 if i >= BEGIN + 10 else 0.0
 
     outcomes = run(day, change)
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     asked = {"suspect_channel:t_q_degc", "unconfirmed_channel:t_q_degc"}
     assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 20 :])
 
@@ -76,14 +74,14 @@ def test_at_that_steps_while_t_q_is_loose_is_asked_about_once_t_q_is_right(day: 
         values["at_degc"] += 1.6 if at <= i < BEGIN + 200 else 0.0
 
     outcomes = run(day, change)
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     assert outcomes[BEGIN + 280].offset.state == "ok"
 
 
 def test_at_that_wobbles_while_it_is_pushed_in_is_no_air(day: dict[str, np.ndarray]) -> None:
     """It is back for two samples and rests elsewhere: air goes back little by little."""
     outcomes = run(day, steps((BEGIN, "at_degc", 4.5), (BEGIN + 10, "at_degc", 0.0), (BEGIN + 12, "at_degc", 1.7)))
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     assert not events(outcomes, "accepted")
 
 
@@ -111,17 +109,15 @@ def test_a_zero_as_air_is_gone_gives_at_no_other_zero(day: dict[str, np.ndarray]
     def change(i: int, values: dict[str, float]) -> None:
         values["at_degc"] += little_by_little(i)
 
-    act = zero_at(BEGIN + after)
-    outcomes = run(day, change, act)
-    assert not is_wrong_in_ok(day, outcomes, act)
-    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[BEGIN + 60 : BEGIN + 150]) < 2.0
+    outcomes = run(day, change, zero_at(BEGIN + after))
+    assert not is_wrong_in_ok(outcomes, zero=BEGIN + after)
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=BEGIN + after))[BEGIN + 60 : BEGIN + 150]) < 2.0
 
 
 def test_a_zero_as_the_channel_beside_comes_back_gives_it_no_other_zero(day: dict[str, np.ndarray]) -> None:
     change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 10, "at_degc", 6.0), (BEGIN + 40, "at_degc", 0.0))
-    act = zero_at(BEGIN + 41)
-    outcomes = run(day, change, act)
-    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[BEGIN + 60 : BEGIN + 150]) < 2.0
+    outcomes = run(day, change, zero_at(BEGIN + 41))
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=BEGIN + 41))[BEGIN + 60 : BEGIN + 150]) < 2.0
 
 
 @pytest.mark.parametrize("later", [-1, 0, 1])
@@ -135,7 +131,7 @@ def test_a_jump_that_nobody_saw_is_asked_about_also_in_the_sample_of_another_one
         (BEGIN + 60, "t_q_degc", 0.0),
     )
     outcomes = run(day, change)
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     asked = {"suspect_channel:at_degc", "unconfirmed_channel:at_degc"}
     assert all(asked & set(o.offset.reasons) for o in outcomes[BEGIN + 2 :])
 
@@ -191,7 +187,7 @@ def test_jumps_of_one_channel_make_no_loose_contact_of_the_other(day: dict[str, 
         (BEGIN + 4, "at_degc", -4.0),
     )
     outcomes = run(day, change)
-    assert not is_wrong_in_ok(day, outcomes)
+    assert not is_wrong_in_ok(outcomes)
     assert not [
         n.text for o in outcomes for n in o.notes if "AT" in n.text and "at rest" in n.text and n.kind == "plausibility"
     ]
@@ -220,9 +216,8 @@ def test_probes_that_are_right_never_confirm_a_sensor_that_is_wrong(day: dict[st
 
 @pytest.mark.parametrize("samples", [1, 2])
 def test_a_zero_as_t_q_comes_back_gives_it_no_other_zero(day: dict[str, np.ndarray], samples: int) -> None:
-    act = zero_at(END + samples)
-    outcomes = run(day, steps((BEGIN, "t_q_degc", 8.0), (END, "t_q_degc", 0.0)), act)
-    assert np.max(np.abs(offsets(outcomes) - offsets(run(day, act=act)))[END + 15 : END + 150]) < 1.0
+    outcomes = run(day, steps((BEGIN, "t_q_degc", 8.0), (END, "t_q_degc", 0.0)), zero_at(END + samples))
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=END + samples))[END + 15 : END + 150]) < 1.0
     assert {o.offset.state for o in outcomes[END + 15 : END + 150]} == {"ok"}
 
 
@@ -233,7 +228,7 @@ def test_a_rest_at_a_wrong_level_states_what_an_engine_without_t_q_does_not_know
     """Both answers come to the same by chance while both are wrong."""
     times = [(BEGIN + 60 * i + j, "t_q_degc", size * (j == 0)) for i in range(2) for j in (0, 20)]
     outcomes = run(day, steps(*times, (BEGIN + 120, "t_q_degc", size)))
-    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    apart = np.abs(offsets(outcomes) - undisturbed())
     stds = np.array([number(o.offset.y_offset_std_um) for o in outcomes])
     told = np.array(
         [o.offset.state == "degraded" and "rate_limited" not in o.offset.reasons for o in outcomes], dtype=bool
@@ -246,12 +241,11 @@ def test_a_rest_at_a_wrong_level_states_what_an_engine_without_t_q_does_not_know
 def test_a_warm_zero_gives_t_q_another_zero_and_leaves_at_in_question(day: dict[str, np.ndarray]) -> None:
     change = steps((BEGIN, "t_q_degc", 8.0), (BEGIN + 30, "at_degc", -1.6), (END + 30, "at_degc", 0.0))
     outcomes = run(day, change, zero_at(BEGIN + 80))
-    assert not is_wrong_in_ok(day, outcomes, zero_at(BEGIN + 80))
+    assert not is_wrong_in_ok(outcomes, zero=BEGIN + 80)
     after = outcomes[BEGIN + 85 : END + 30]
     assert all("unconfirmed_channel:at_degc" in o.offset.reasons for o in after)
     assert not any("suspect_channel:t_q_degc" in o.offset.reasons for o in after)
-    healthy = offsets(run(day, act=zero_at(BEGIN + 80)))
-    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 45 : END + 145]) < 1.5
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=BEGIN + 80))[END + 45 : END + 145]) < 1.5
 
 
 @pytest.mark.parametrize("t_q", [4.5, -4.0])
@@ -260,7 +254,7 @@ def test_what_is_refuted_beside_is_undone_in_the_compensation(day: dict[str, np.
     outcomes = run(day, steps((BEGIN, "at_degc", 5.0), (BEGIN + 3, "t_q_degc", t_q)))
     suspect = next(i for i, o in enumerate(outcomes) if "suspect_channel:t_q_degc" in o.offset.reasons)
     assert suspect <= BEGIN + 5
-    apart = np.abs(offsets(outcomes) - offsets(run(day)))
+    apart = np.abs(offsets(outcomes) - undisturbed())
     assert np.max(apart[suspect + 2 : BEGIN + 12]) < 3.0
 
 
@@ -282,10 +276,9 @@ def test_a_zero_is_what_the_compensation_estimated_also_after_a_long_gap(day: di
         values["t_q_degc"] += 6.0 if BEGIN <= i < END else 0.0
 
     outcomes = run(day, change, zero_at(BEGIN + 106))
-    healthy = offsets(run(day, act=zero_at(BEGIN + 106)))
     assert "unconfirmed_channel:t_q_degc" in outcomes[BEGIN + 106].offset.reasons
     assert number(outcomes[BEGIN + 106].estimate.y_pred_um) == pytest.approx(0.0, abs=0.3)
-    assert np.max(np.abs(offsets(outcomes) - healthy)[END + 20 : END + 120]) < 1.5
+    assert np.max(np.abs(offsets(outcomes) - undisturbed(zero=BEGIN + 106))[END + 20 : END + 120]) < 1.5
 
 
 DRAWN = 6
@@ -344,7 +337,7 @@ def test_the_deviation_is_the_same_after_a_restart_while_the_second_channel_is_s
     )
 
     def restarted(i: int, compensation: Compensation) -> None:
-        if i > BEGIN:
+        if BEGIN < i < BEGIN + 240:
             compensation.restore(compensation.state())
 
     live, again = run(day, change), run(day, change, restarted)
