@@ -78,7 +78,7 @@ def ridge(y, used):
     return table @ fitted(used, min((1e-4, 1e-3, 1e-2, 1e-1), key=left))
 
 
-def one(probe, fit_h, judge_h, *, beside=True):
+def one(probe, fit_h, judge_h):
     """Return rms and mean absolute errors on the hours that judge, µm, by name, and what was found."""
     roles = ["--column", "t_q_degc=t5_degc", "--column", "at_degc=t16_degc", "--column", f"y_um=ch{probe}_um"]
     with tempfile.TemporaryDirectory() as name:
@@ -96,8 +96,7 @@ def one(probe, fit_h, judge_h, *, beside=True):
     used = np.zeros(y.size, dtype=bool)
     used[fit_h[0] * 60 : fit_h[1] * 60] = True
     predicted |= {"none": np.zeros(y.size), "persistence": np.full(y.size, y[judge_h[0] * 60 - 1])}
-    if beside:
-        predicted["ridge, all"] = ridge(y, used)
+    predicted["ridge, all"] = ridge(y, used)
     errors = {
         label: (
             float(np.sqrt(np.nanmean((y - p)[judged] ** 2))),

@@ -22,7 +22,7 @@ from compensator.model.effects.blocks import FilterBank, lag_or_none
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
-from tests.bench.spindle import FILE, SPLITS, one
+from tests.bench.spindle import FILE
 from tests.identify.quill_runs import runs_from
 
 
@@ -232,16 +232,6 @@ def test_held_out_samples_do_not_take_part(model, runs):
     other = dataclasses.replace(other, probe_um=evidence.probe_um, runs=evidence.runs)
     again = findings_of(other.with_free_paths().without(block)).whole
     assert again == pytest.approx(before, abs=1e-5 * np.std(before))
-
-
-@pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")
-def test_the_measured_spindle_lacks_its_speed():
-    """Fitted to 20 h, judged on the 12 h after them: a speed beyond any that was seen."""
-    fit_h, judge_h = SPLITS[2]
-    errors, found = one(3, fit_h, judge_h, beside=False)
-    assert "spindle_rpm" in found
-    assert errors["extended"][0] < 0.35 * errors["two inputs"][0]
-    assert errors["extended"][0] < 0.25 * errors["persistence"][0]
 
 
 @pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")

@@ -39,6 +39,7 @@ def test_the_measured_spindle_lacks_its_speed(tmp_path: Path, monkeypatch: pytes
     assert rms["no compensation"] > 12.0
     assert rms["extended"] < 0.3 * rms["two inputs"]
     assert rms["extended"] < 0.15 * rms["no compensation"]
+    assert rms["extended"] < 0.25 * rms["persistence"]
     assert outputs.count("PNG") == 3
     assert (tmp_path / "spindle-out/diagnosis/report.html").exists()
 
