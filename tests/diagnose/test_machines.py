@@ -7,8 +7,8 @@ from compensator.diagnose.diagnosis import diagnose
 from sim_hardware.physics import Duty, draw_effect
 from tests.bench import machines
 
-#: Thirteen seeds in a row draw thirteen kinds.
-SEEDS = range(400, 413)
+#: Each draws another kind.
+SEEDS = (*range(400, 408), 409, 410, 412)
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +24,9 @@ def results(first):
 
 def test_effects_of_every_kind_are_named(results):
     kinds = {place[0] for place, *_ in results}
-    assert len(kinds) == 11
+    assert len(kinds) == len(SEEDS) == 11
     missed = [(place, named) for place, named, *_ in results if place not in named]
-    assert len(missed) <= 2, missed
+    assert len(missed) <= 1, missed
 
 
 def test_the_extended_model_takes_the_error_off_a_day_that_nothing_saw(results):
