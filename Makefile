@@ -17,7 +17,7 @@ demo: $(VENV)/.ready
 test check: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.ready
-	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
+	$(BIN)/python -m compileall -q -j 0 compensator drivers sim_hardware tests
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.ready
@@ -25,7 +25,7 @@ check: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m compileall -q compensator drivers sim_hardware tests
+	$(BIN)/python -m compileall -q -j 0 compensator drivers sim_hardware tests
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 soak: $(VENV)/.ready
