@@ -19,13 +19,36 @@ from compensator.model.model_writer import write_axes
 from compensator.report.results import pages_in
 from tests.cli.test_axes import write
 from tests.diagnose.axes_data import machine, models
+from tests.shared_folder import search_once
 
 PLACE = ("input", "", "coolant_degc")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _each_question_once(tmp_path_factory):
+    """The same axis in the same data is searched once, whether all axes are asked for, some, or it alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        search_once(patch, tmp_path_factory)
+        yield
+
+
+def acting():
+    """A table of a machine whose coolant moves Y and Z."""
+    return machine(1, {"y": 2.0, "z": -4.0}, hours=14.0)
+
+
 @pytest.fixture(scope="module")
-def found():
-    return tc.diagnose(models(), machine(1, {"y": 2.0, "z": -4.0}, hours=24.0))
+def files(tmp_path_factory):
+    """Its models, which do not know that, and the table."""
+    folder = tmp_path_factory.mktemp("axes")
+    write(folder / "run.csv", {k: np.asarray(v) for k, v in acting().items()})
+    write_axes(folder / "base.toml", models())
+    return folder / "base.toml", folder / "run.csv"
+
+
+@pytest.fixture(scope="module")
+def found(files):
+    return tc.diagnose(*files)
 
 
 def test_an_effect_of_two_axes_is_named_with_its_axes(found):
@@ -38,17 +61,17 @@ def test_an_effect_of_two_axes_is_named_with_its_axes(found):
     assert found.verdict == "explained" and found["x"].verdict == "adequate"
 
 
-def test_each_axis_gets_its_own_effect_in_one_file(found, tmp_path):
+def test_each_axis_gets_its_own_effect_in_one_file(found, files, tmp_path):
     loaded = load_axes(found.save(tmp_path / "model.toml"))
     assert [len(loaded[axis].effects) for axis in ("x", "y", "z")] == [0, 1, 1]
-    table = machine(1, {"y": 2.0, "z": -4.0}, hours=24.0)
-    before, after = tc.simulate(models(), table), tc.simulate(loaded, table)
+    base, table = files
+    before, after = tc.simulate(base, table), tc.simulate(loaded, table)
     for axis in ("y", "z"):
         assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
 
 
 def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
-    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}, hours=18.0))
+    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}, hours=12.0))
     [effect] = found.machine
     assert effect.place[0] == "step" and effect.suspect == "z"
     assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
@@ -65,10 +88,9 @@ def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():
     assert not MachineEffect(place=PLACE, shares=(alone,)).suspect, "nothing to compare with"
 
 
-def test_y_alone_is_diagnosed_as_without_the_other_axes():
-    table = machine(1, {"y": 2.0, "z": -4.0}, hours=12.0)
-    alone = tc.diagnose(models()["y"], {name: v for name, v in table.items() if name not in ("x_um", "z_um")})
-    chosen = tc.diagnose(models(), table, axis="y")
+def test_y_alone_is_diagnosed_as_without_the_other_axes(files):
+    table = {name: v for name, v in acting().items() if name not in ("x_um", "z_um")}
+    alone, chosen = tc.diagnose(models()["y"], table), tc.diagnose(*files, axis="y")
     assert chosen.to_dict() | {"free_run": []} == alone.to_dict() | {"free_run": []}
 
 
@@ -87,11 +109,10 @@ def test_what_another_axis_shows_is_no_choice_among_many():
     assert others and all(with_it == without for with_it, without in others)
 
 
-def test_the_command_writes_the_axis_of_each_effect(tmp_path, capsys):
-    write(tmp_path / "run.csv", {k: np.asarray(v) for k, v in machine(1, {"y": 2.0, "z": -4.0}, hours=18.0).items()})
-    write_axes(tmp_path / "base.toml", models())
+def test_the_command_writes_the_axis_of_each_effect(files, tmp_path, capsys):
+    base, table = files
     out = tmp_path / "found"
-    arguments = ["diagnose", str(tmp_path / "run.csv"), "--model", str(tmp_path / "base.toml"), "--out", str(out)]
+    arguments = ["diagnose", str(table), "--model", str(base), "--out", str(out)]
     assert main([*arguments, "--axis", "y", "--axis", "z"]) == 0
     assert "coolant_degc (input) moves Z by −" in capsys.readouterr().out
     written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
