@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
 from compensator.identify.calibration import predict
 from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
@@ -59,12 +61,13 @@ def test_a_fluid_whose_temperature_does_not_move_is_one():
     columns, _, _ = record([Scenario(place=("input", "", "fan_rpm"), act=act)], 1402)
     rng = np.random.default_rng(1402)
     columns["coolant_degc"] = 22.0 + rng.normal(0.0, 0.02, columns["y_um"].size)
-    unclear = diagnose(QUILL, runs_from(columns))
-    assert all(effect.effect.channels != ("fan_rpm", "coolant_degc") for effect in unclear.effects)
+    unclear = findings_of(evidence_of(QUILL, runs_from(columns)))
+    assert all(term.effect.channels != ("fan_rpm", "coolant_degc") for term in unclear.terms)
     columns["coolant_lpm"] = columns.pop("fan_rpm") / 100.0
-    [effect] = diagnose(QUILL, runs_from(columns)).effects
-    assert effect.effect.channels == ("coolant_lpm", "coolant_degc")
-    assert effect.rms_after_um < 0.35
+    found = findings_of(evidence_of(QUILL, runs_from(columns)))
+    [term] = found.terms
+    assert term.effect.channels == ("coolant_lpm", "coolant_degc")
+    assert found.rest_um < 0.35
 
 
 @pytest.mark.parametrize(("channel", "name"), [("a_rpm", "_rpm"), ("a_l_per_min", "_l_per_min"), ("coolant_flow", "")])

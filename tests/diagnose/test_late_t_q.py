@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from compensator.data.runs import Run
 from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
 from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
 from compensator.identify.calibration import predict
-from compensator.model.effects.base import effect_from, filters
+from compensator.model.effects.base import Effect, effect_from, filters
 from compensator.model.effects.delay import DelayedSensor
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.engine import Engine
@@ -53,17 +55,22 @@ def error(model: ThermalModel, run: Run, y: np.ndarray) -> float:
 def removed(found: Diagnosis, late: list[Scenario], others: list[Scenario]) -> float:
     """The share that the model file removes, on a fresh day, of what a T_Q that is not late would remove."""
     deployed = parse_model(dump_model(found.model).encode(), source="model.toml")
-    (columns, true, _), (prompt, _, effect) = (record(scenarios, 5100, 24.0) for scenarios in (late + others, others))
+    (columns, true, _), (prompt, _, effect) = (record(scenarios, 5100, 18.0) for scenarios in (late + others, others))
     base = error(QUILL, runs_from(columns)[0], true)
     possible = base - error(QUILL, runs_from(prompt)[0], true - effect)
     return (base - error(deployed, runs_from(columns)[0], true)) / possible
 
 
+@functools.cache
+def diagnosed(lag_min: float, delay_min: float) -> tuple[Run, Diagnosis]:
+    """A day with a late T_Q, and what is found in it."""
+    [run] = runs_from(record([sensor(lag_min, delay_min)], 1100, 36.0)[0])
+    return run, diagnose(QUILL, [run])
+
+
 @pytest.mark.parametrize(("lag_min", "delay_min", "least"), [(6.0, 0.0, 0.97), (0.0, 4.0, 0.9)])
 def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: float, least: float) -> None:
-    late = sensor(lag_min, delay_min)
-    columns, _, _ = record([late], 1100, 36.0)
-    found = diagnose(QUILL, runs_from(columns))
+    run, found = diagnosed(lag_min, delay_min)
     [effect] = found.effects
     assert effect.place == PLACE
     assert effect.deployable
@@ -71,11 +78,10 @@ def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: flo
     total = sum(value for name, value in effect.named.items() if name.endswith("_min"))
     assert total == pytest.approx(lag_min + delay_min, abs=0.6)
     assert "in real time" in effect.explanation
-    assert removed(found, [late], []) > least
+    assert removed(found, [sensor(lag_min, delay_min)], []) > least
     # Nothing is left beside what the engine states, and with no error of its own the residual would not be watched.
     assert found.model.y_std_um == pytest.approx(0.09, rel=0.2)
     # What is promised is what the engine leaves, and not what could be known afterwards.
-    [run] = runs_from(columns)
     left_um = np.sqrt(error(found.model, run, run.y_um))
     assert found.after.rms_um == pytest.approx(left_um, rel=0.1)
     assert effect.rms_after_um == pytest.approx(left_um, rel=0.1)
@@ -95,7 +101,7 @@ def test_what_a_dead_time_hides_another_channel_shows() -> None:
     [effect] = found.effects
     assert effect.place == PLACE
     assert found.remainder is not None and found.remainder.deployed and found.remainder.channels == ("motor_w",)
-    fresh, true = with_power(5106, 24.0)
+    fresh, true = with_power(5106, 16.0)
     [run] = runs_from(fresh)
     deployed = parse_model(dump_model(found.model).encode(), source="model.toml")
     corrected = dataclasses.replace(deployed, effects=(effect.effect,))
@@ -113,15 +119,20 @@ def direct_run(seed: int, hours: float, delay_min: float) -> tuple[Run, np.ndarr
     return runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise_um})[0], y
 
 
+def late_in(base: ThermalModel, runs: list[Run]) -> Effect:
+    """The one effect that a search names, as the engine runs it."""
+    [term] = findings_of(evidence_of(base, runs)).terms
+    return term.effect
+
+
 def test_how_the_drive_goes_on_is_learned_with_a_late_t_q() -> None:
     """T_Q − AT of a direct model does not stay where it is: what a dead time hides of it is foreseen in part."""
     base = direct("kalman")
-    [effect] = diagnose(base, [direct_run(1108, 24.0, 10.0)[0]]).effects
-    late = effect.effect
+    late = late_in(base, [direct_run(1108, 14.0, 10.0)[0]])
     assert isinstance(late, DelayedSensor) and late.behind_min > 1.0
     stays = dataclasses.replace(late, walk_times=1.0, behind_min=0.0)
-    fresh, true = direct_run(5108, 24.0, 10.0)
-    prompt = error(base, direct_run(5108, 24.0, 0.0)[0], true)
+    fresh, true = direct_run(5108, 14.0, 10.0)
+    prompt = error(base, direct_run(5108, 14.0, 0.0)[0], true)
     held, foreseen = (error(dataclasses.replace(base, effects=(one,)), fresh, true) for one in (stays, late))
     assert foreseen - prompt < 0.6 * (held - prompt)
 
@@ -129,11 +140,10 @@ def test_how_the_drive_goes_on_is_learned_with_a_late_t_q() -> None:
 def test_how_fast_the_heat_moves_is_learned_with_a_late_t_q() -> None:
     """A calibration with hardly a change of the heat says that it hardly moves, and the correction comes late."""
     calm = dataclasses.replace(QUILL, estimator=dataclasses.replace(QUILL.estimator, drive_walk_std=0.5))
-    columns, _, _ = record([sensor(0.0, 2.0)], 1109, 24.0)
-    [effect] = diagnose(calm, runs_from(columns)).effects
-    late = effect.effect
+    columns, _, _ = record([sensor(0.0, 2.0)], 1109, 14.0)
+    late = late_in(calm, runs_from(columns))
     assert isinstance(late, DelayedSensor) and late.walk_times > 2.0 and late.behind_min == 0.0
-    fresh, true, _ = record([sensor(0.0, 2.0)], 5109, 24.0)
+    fresh, true, _ = record([sensor(0.0, 2.0)], 5109, 14.0)
     before, after = (
         error(dataclasses.replace(calm, effects=(one,)), runs_from(fresh)[0], true)
         for one in (dataclasses.replace(late, walk_times=1.0), late)
@@ -164,14 +174,10 @@ def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
 
 
 def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
-    late = sensor(3.0, 2.0)
-    columns, _, _ = record([late], 1102, 24.0)
-    runs = runs_from(columns)
-    found = diagnose(QUILL, runs)
-    own = signals_of(found.model, runs[0])
-    np.testing.assert_array_equal(own.share("all"), predict(found.model, runs[0]))
-    again = diagnose(found.model, runs)
-    assert [e.place for e in again.effects] == []
+    run, found = diagnosed(0.0, 4.0)
+    own = signals_of(found.model, run)
+    np.testing.assert_array_equal(own.share("all"), predict(found.model, run))
+    assert findings_of(evidence_of(found.model, [run])).terms == ()
 
 
 def test_what_flows_beside_a_late_t_q_gets_the_engines_temperatures() -> None:
@@ -179,7 +185,7 @@ def test_what_flows_beside_a_late_t_q_gets_the_engines_temperatures() -> None:
     table = {"form": "flow", "channel": "flow_lpm", "fluid": "coolant_degc", "span": 10.0, "half": 0.5}
     flow = effect_from("input", table | {"tau_min": [20.0], "gain": [0.5], "gain_air": [0.2]})
     model = dataclasses.replace(QUILL, effects=(late, flow))
-    columns, _, _ = record([sensor(0.0, 8.0)], 1103, 24.0)
+    columns, _, _ = record([sensor(0.0, 8.0)], 1103, 12.0)
     minutes = np.arange(columns["y_um"].size)
     channels = {"flow_lpm": 10.0 * (minutes % 90 > 30), "coolant_degc": 22.0 + 0.0 * minutes}
     [run] = runs_from({name: columns[name] for name in ("t_q_degc", "at_degc", "y_um")} | channels)
@@ -193,7 +199,7 @@ def test_what_flows_beside_a_late_t_q_gets_the_engines_temperatures() -> None:
 
 def test_a_late_thermocouple_of_another_hand() -> None:
     """Ten seconds a step, and means over a minute."""
-    duty = Duty.working_day(43, hours=36.0)
+    duty = Duty.working_day(43, hours=24.0)
     sensors = usual_sensors(duty.extra_names, temperature_noise_k=0.05, y_noise_um=1.0)
 
     def columns(effects: list[LateSensor], seed: int) -> dict[str, np.ndarray]:
@@ -213,20 +219,20 @@ def test_a_late_thermocouple_of_another_hand() -> None:
 
 
 def test_a_thermocouple_that_is_late_for_the_ambient_too() -> None:
-    t_q, at, y = run_of(1104, 24.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    t_q, at, y = run_of(1104, 14.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
     noise = np.random.default_rng(2).normal(0.0, 0.3, y.size)
     found = diagnose(QUILL, runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise}))
     assert [e.place for e in found.effects] == [PLACE]
     assert found.effects[0].form.startswith("sensor")
-    t_q, at, y = run_of(1105, 24.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    t_q, at, y = run_of(1105, 14.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
     [fresh] = runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y})
     assert error(found.model, fresh, y) < 0.02 * error(QUILL, fresh, y)
 
 
 def test_a_direct_model_names_its_sensor() -> None:
     late, base = sensor(4.0, 0.0), direct("kalman")
-    columns, _, _ = record([late], 1103, 24.0)
-    _, _, _, _, _, y_tdtf, difference = signals(1103, 24.0)
+    columns, _, _ = record([late], 1103, 14.0)
+    _, _, _, _, _, y_tdtf, difference = signals(1103, 14.0)
     y = base.dtf.sampled.response(difference) + y_tdtf
     columns["y_um"] = y + np.random.default_rng(1).normal(0.0, 0.1, y.size)
     found = diagnose(base, runs_from(columns))

@@ -36,7 +36,9 @@ def warm(kind, *, size_um=6.0, hours=24.0):
 
 @functools.cache
 def diagnosed(kind):
-    return diagnose(QUILL, runs_from(warm(kind)[1]))
+    """What is found in its first 16 h."""
+    columns = warm(kind)[1]
+    return tc.diagnose("quill", {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}, fit_until_h=16.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -56,15 +58,15 @@ def test_the_effect_alone_is_named_and_holds_on_a_day_that_begins_at_rest(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_user_is_told_from_where_the_effect_counts(kind):
-    said = [str(one) for one in diagnosed(kind).warnings if one.code == ModelWarning.WARM_START]
+    said = [str(one) for one in diagnosed(kind).diagnosis.warnings if one.code == ModelWarning.WARM_START]
     assert len(said) == 1
     assert EQUAL in said[0]
 
 
 def test_the_free_run_of_the_extended_model_begins_as_warm_as_the_record():
-    columns = warm("nonlinear")[1]
-    result = tc.diagnose("quill", {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}, fit_until_h=16.0)
-    for rows in result.free_run:
+    free_run = diagnosed("nonlinear").free_run
+    assert len(free_run) == 2
+    for rows in free_run:
         assert rows.scores["extended model"].rms_about_mean_um < 0.5 * rows.scores["base model"].rms_about_mean_um
 
 
@@ -93,7 +95,7 @@ def test_couples_that_differ_at_rest_do_not_make_a_record_warm():
 
 def test_after_a_long_gap_an_effect_counts_from_the_start_before_it():
     scenario = draw("nonlinear", 5, 6.0)
-    columns, _, _ = record([scenario], 1305)
+    columns, _, _ = record([scenario], 1305, 26.0)
     above = columns["t_q_degc"] - columns["at_degc"]
     end = 600 + int(np.argmax(above[600:1200]))
     for name in ("t_q_degc", "at_degc", "y_um"):
