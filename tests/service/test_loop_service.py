@@ -48,7 +48,7 @@ shadow_h = 6.0
 
 
 #: The service starts so long before the night's diagnosis, samples; none of these needs a whole day before it.
-EVENING = 6 * 60
+EVENING = 60
 
 
 class Looping(Machine):
@@ -199,7 +199,7 @@ def in_phase(machine: Looping, phase: str, then: Callable[[], None] = lambda: No
 
 async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()), policy="propose")
-    early = machine.at_sample[420] = Asked(machine, "adopt", candidate=True)
+    early = machine.at_sample[EVENING + 60] = Asked(machine, "adopt", candidate=True)
     await machine.run(960, until=in_phase(machine, "proposed"))
     assert not early.answer["ok"] and "not proposed yet" in early.answer["text"]
     assert machine.store.in_use() == QUILL and machine.steps()[-1] == ("propose", "")
@@ -236,8 +236,8 @@ async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(t
         yes()
         no()
 
-    machine.at_sample[420] = both
-    await machine.run(480)
+    machine.at_sample[EVENING + 60] = both
+    await machine.run(EVENING + 120)
     assert yes.answer["ok"], yes.answer
     assert not no.answer["ok"] and "answered already" in no.answer["text"], no.answer
     assert machine.store.in_use() == extended()
@@ -245,8 +245,8 @@ async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(t
 
 async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    no = machine.at_sample[420] = Asked(machine, "dismiss")
-    await machine.run(1440 + 420)
+    no = machine.at_sample[EVENING + 60] = Asked(machine, "dismiss")
+    await machine.run(1440 + EVENING + 60)
     assert no.answer["ok"], no.answer
     again = machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "dismiss")
     await machine.run(20)
@@ -264,7 +264,7 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
     machine = Looping(tmp_path, shown(extended()))
     other = extended(2.9)
     adopt = Asked(machine, "adopt", model=other.decode(), sha256=sha256_of(other))
-    machine.at_sample[460] = adopt
+    machine.at_sample[EVENING + 100] = adopt
     await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(other))
     assert adopt.answer["ok"], adopt.answer
     await machine.run(30)
@@ -276,16 +276,18 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
 
 async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path) -> None:
     machine = Looping(tmp_path / "killed", shown(extended()))
-    await machine.run(410)
+    await machine.run(EVENING + 50)
     await machine.run_and_kill(100)
     await machine.run(600, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     always = Looping(tmp_path / "always", shown(extended()))
-    await always.run(1110, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await always.run(EVENING + 750, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     assert machine.steps() == always.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
     ends = [one.outcomes[-1].sample.time_utc_ns for one in (machine, always)]
     # The pauses cost samples, and the comparison the block that they are in.
     assert abs(ends[0] - ends[1]) <= 3600e9
-    assert {one.seq for one in machine.candidates()} >= {o.sample.seq for o in machine.outcomes[420:500]}
+    assert {one.seq for one in machine.candidates()} >= {
+        o.sample.seq for o in machine.outcomes[EVENING + 60 : EVENING + 140]
+    }
     checked(machine)
 
 
@@ -299,7 +301,7 @@ async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made
         raise AssertionError
 
     answers, machine.diagnose = machine.diagnose, hanging  # type: ignore[method-assign]
-    await machine.run_and_kill(410)
+    await machine.run_and_kill(EVENING + 50)
     assert len(machine.asked) == 1 and machine.steps() == [("diagnose", "planned")]
     machine.diagnose, machine.waits_for_diagnoses = answers, True  # type: ignore[method-assign]
     await machine.run(100)
@@ -318,7 +320,7 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
         raise AssertionError
 
     machine.diagnose = hanging  # type: ignore[method-assign]
-    await machine.run(410)
+    await machine.run(EVENING + 50)
     await machine.run(200, until=lambda _: len(machine.asked) == 2)
     for _ in range(2):
         await machine.run(10)
@@ -380,7 +382,7 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
 
 async def test_another_policy_ends_the_shadow_at_the_restart_and_holds_from_then_on(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    await machine.run(660)
+    await machine.run(EVENING + 300)
     assert machine.steps()[-1] == ("shadow", "")
     machine.use(machine.config_bytes.replace(b'policy = "adopt"', b'policy = "propose"'))
     await machine.run(5)
@@ -402,16 +404,16 @@ async def test_a_defect_of_the_shadow_ends_the_shadow_and_never_a_sample(
     works = Shadow.process
 
     def breaks(shadow: Shadow, outcome: Outcome) -> Any:
-        if len(machine.outcomes) == 460:
+        if len(machine.outcomes) == EVENING + 100:
             raise ZeroDivisionError("a defect")
         return works(shadow, outcome)
 
     monkeypatch.setattr(Shadow, "process", breaks)
-    await machine.run(480)
+    await machine.run(EVENING + 120)
     monkeypatch.setattr(Shadow, "process", works)
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "failed")]
-    states = {outcome.offset.state for outcome in machine.outcomes[450:]}
-    assert states == {"ok"} and len(machine.outcomes) == 480
+    states = {outcome.offset.state for outcome in machine.outcomes[EVENING + 90 :]}
+    assert states == {"ok"} and len(machine.outcomes) == EVENING + 120
     assert "a defect" in machine.events("loop")[-1].text
     checked(machine)
 
