@@ -36,6 +36,15 @@ def test_axes_share_the_time_constants_that_the_data_permit_and_no_others(found)
         assert found[axis].params["dtf_gain_um_per_k"] == pytest.approx(gain, rel=0.03)
 
 
+def test_axes_with_common_time_constants_have_the_order_that_the_data_permit():
+    found = tc.identify(machine(axes=("y", "z")))
+    assert found.shared == (("y", "z"),)
+    for axis, gain in (("y", 5.0), ("z", 7.0)):
+        assert [found[axis].params[f"dtf_tau_{i}_min"] for i in (1, 2)] == pytest.approx([30.0, 150.0], rel=0.05)
+        assert "dtf_tau_3_min" not in found[axis].params
+        assert found[axis].params["dtf_gain_um_per_k"] == pytest.approx(gain, rel=0.03)
+
+
 def test_no_axis_is_clearly_worse_than_alone_and_its_errors_are_smaller(found):
     for axis in ("y", "z"):
         alone = tc.identify(machine(axes=(axis,)), order=(2, 2, 2))
@@ -193,7 +202,7 @@ def test_probes_that_move_against_each_other_are_said_in_the_lines():
 def test_five_probes_of_the_measured_spindle_in_one_command():
     roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc"}
     probes = [f"ch{i}" for i in range(1, 6)]
-    found = tc.identify(SPINDLE, columns=roles, axis=probes)
+    found = tc.identify(SPINDLE, columns=roles, axis=probes, order=(2, 2, 2))
     assert {frozenset(group) for group in found.shared} == {frozenset(("ch1", "ch2")), frozenset(("ch3", "ch4"))}
     assert [(one.first, one.second) for one in found.pairs] == [("ch1", "ch2"), ("ch3", "ch4")]
     assert "[axis.a]" in found.tilt_lines() and 'probes = ["ch3", "ch4"]' in found.tilt_lines().split("[axis.b]")[1]
