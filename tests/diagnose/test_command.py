@@ -1,6 +1,8 @@
 """`compensator diagnose` as its user runs it."""
 
+import contextlib
 import dataclasses
+import io
 import json
 
 import numpy as np
@@ -23,10 +25,25 @@ def table(tmp_path_factory):
     return path
 
 
-def test_json_model_and_page(tmp_path, table, capsys):
-    out = tmp_path / "diagnosis"
-    assert main(["diagnose", str(table), "--model", "quill", "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """The published model, which states hardly an error of its own."""
+    path = tmp_path_factory.mktemp("base") / "base.toml"
+    write_model(path, dataclasses.replace(load_model("quill"), y_std_um=0.05))
+    return path
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory, table, base):
+    """Folder of its diagnosis, and what that prints."""
+    out = tmp_path_factory.mktemp("first") / "diagnosis"
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["diagnose", str(table), "--model", str(base), "--out", str(out)]) == 0
+    return out, printed.getvalue()
+
+
+def test_json_model_and_page(first, base):
+    out, printed = first
     # Every effect is named in the first sentence, not the largest alone.
     assert "Scheduled: DTF fan_rpm; Drift. On held-out data" in printed.splitlines()[0]
     found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
@@ -44,18 +61,14 @@ def test_json_model_and_page(tmp_path, table, capsys):
     assert all({"kind", "channel", "rms_after_um", "how_to_tell_apart"} <= set(rival) for rival in found["rivals"])
     model = load_model(out / "model.toml")
     assert [effect.kind for effect in model.effects] == ["scheduled"]
-    assert model.provenance["diagnosis"]["base_model_sha256"] == load_model("quill").sha256
+    assert model.provenance["diagnosis"]["base_model_sha256"] == load_model(base).sha256
     page = (out / "report.html").read_text(encoding="utf-8")
     for words in ("before and after", "Errors on held-out data", "ranked", model.sha256):
         assert words in page
 
 
-def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
-    out = tmp_path / "first"
-    base = tmp_path / "base.toml"
-    write_model(base, dataclasses.replace(load_model("quill"), y_std_um=0.05))
-    assert main(["diagnose", str(table), "--model", str(base), "--out", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["effects"][1]["kind"] == "drift"
+def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, first, capsys):
+    out = first[0]
     # The drift is of the measurement: what the service states is the error on the machine.
     _, drifted, _ = record([draw("scheduled", 3), draw("drift", 3)], 77, 24.0)
     _, scheduled, _ = record([draw("scheduled", 3)], 77, 24.0)

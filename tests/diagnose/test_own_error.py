@@ -94,11 +94,17 @@ def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios
     assert [term.hypothesis.place[0] for term in found.terms] == ["step"] and found.remainder is None
 
 
-@pytest.mark.parametrize(("helps", "share"), [(1.0, 1.0), (0.4, 0.4), (-0.2, 0.0)])
-def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(helps, share):
-    """Of what it does on the held-out blocks, so much is right there; the rest is true of the record only."""
+@pytest.fixture(scope="module")
+def beside():
+    """What is found where an own error is deployed beside a coolant."""
     columns, _, _ = record([draw("input", 3, 5.0)], 80, 24.0)
-    found = findings_of(evidence_of(BASE, runs_from(columns)))
+    return findings_of(evidence_of(BASE, runs_from(columns)))
+
+
+@pytest.mark.parametrize(("helps", "share"), [(1.0, 1.0), (0.4, 0.4), (-0.2, 0.0)])
+def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(beside, helps, share):
+    """Of what it does on the held-out blocks, so much is right there; the rest is true of the record only."""
+    found = beside
     assert found.belongs
     random = np.random.default_rng(1)
     own = found.remainder.added - np.mean(found.remainder.added)

@@ -18,7 +18,7 @@ from tests.service.test_restart import QUILL
 
 #: Both tests of an effect that began within the record ask about the same one: it is searched once.
 once = pytest.mark.usefixtures("equal_questions_once")
-SAMPLES, BEGINS = 2160, 720
+SAMPLES, BEGINS = 1440, 480
 
 
 @pytest.fixture(scope="module")

@@ -419,11 +419,11 @@ async def test_a_defect_of_the_shadow_ends_the_shadow_and_never_a_sample(
 
 
 async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp_path: Path) -> None:
-    machine = Looping(tmp_path, before_night=600)
+    machine = Looping(tmp_path, before_night=480)
     machine.diagnose = DiagnosisProcess(  # type: ignore[method-assign]
         machine.config, machine.recordings, machine.store.folder / "diagnoses"
     )
-    await machine.run(650, until=in_phase(machine, "shadow"))
+    await machine.run(530, until=in_phase(machine, "shadow"))
     assert machine.steps() == [("diagnose", "planned"), ("shadow", "")]
     found = machine.events("diagnosis")[-1].data
     assert found["verdict"] == "explained" and found["effects"] == ["input:coolant_degc"]
