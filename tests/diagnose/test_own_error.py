@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 import compensator as tc
-from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose import diagnosis
 from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
@@ -125,14 +125,28 @@ def changed():
     return machine, tc.identify(machine.calibration.columns).model
 
 
+@pytest.fixture(scope="module")
+def learned(changed):
+    """The diagnosis of the changed machine, and what its search in all of the record found."""
+    machine, base = changed
+    searches = []
+
+    def kept(*arguments):
+        searches.append(findings_of(*arguments))
+        return searches[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosis, "findings_of", kept)
+        return tc.diagnose(base, machine.record.columns), searches[0]
+
+
 def errors_on_another_day(machine, *models):
     day = machine.fresh
     return [np.std(day.true_um - tc.simulate(model, day.columns)["y_pred_um"]) for model in models]
 
 
-def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(changed):
-    machine, base = changed
-    why = tc.diagnose(base, machine.record.columns)
+def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(changed, learned):
+    (machine, base), (why, _) = changed, learned
     assert [(effect.kind, effect.path) for effect in why.effects] == [("dynamics", "DTF")]
     rest = figures(why.diagnosis)["remainder"]
     assert rest["deployed"] and rest["instead"] and rest["belongs"]
@@ -156,10 +170,8 @@ def test_it_is_deployed_alone_where_no_name_explains_most_of_it(changed, monkeyp
     assert after_um < 0.3 * before_um
 
 
-def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_it(changed):
-    machine, base = changed
-    runs, _ = runs_in(measurements(machine.record.columns, "data", None), base.period_s)
-    found = findings_of(evidence_of(base, runs))
+def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_it(learned):
+    found = learned[1]
     assert found.is_own_error_alone and found.terms and not found.explains
     nothing = found.search.evidence.residual
     held_out = held_out_errors(nothing, named=0.5 * nothing, whole=1.5 * nothing, ceiling=2.0 * nothing)

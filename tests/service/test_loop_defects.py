@@ -14,7 +14,7 @@ from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Shadow
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import extended, shown, stronger
-from tests.service.test_loop_service import Asked, Looping, checked
+from tests.service.test_loop_service import EVENING, Asked, Looping, checked
 from tests.service.test_loop_several import Early
 from tests.service.test_restart import QUILL
 
@@ -59,10 +59,10 @@ async def test_between_two_samples_and_in_a_warm_up(
 ) -> None:
     machine = Looping(tmp_path, shown(extended()))
     broken = Breaks(monkeypatch, owner, name)
-    await machine.run(420)
+    await machine.run(EVENING + 60)
     assert broken.calls and "ZeroDivisionError: a defect" in said(machine)
     monkeypatch.undo()
-    unharmed(machine, 420)
+    unharmed(machine, EVENING + 60)
     if name != "receive":  # a replay meets a defect of the rules, too
         checked(machine)
 
@@ -81,7 +81,7 @@ async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = Early(tmp_path, shown(extended()), shown(stronger(0.1)), acts=lambda i: 0.5)
-    await machine.run(480)
+    await machine.run(EVENING + 120)
     broken = Breaks(monkeypatch, found, "warm_up")
     later = itertools.count()
     await machine.run(600, until=lambda _: bool(broken.calls) and next(later) == 60)
@@ -93,11 +93,11 @@ async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
 
 async def test_at_an_operators_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    machine.at_sample[420] = Asked(machine, "dismiss")
+    machine.at_sample[EVENING + 60] = Asked(machine, "dismiss")
     broken = Breaks(monkeypatch, Loop, "dismiss")
-    await machine.run(480)
+    await machine.run(EVENING + 120)
     assert broken.calls and "a defect" in said(machine)
-    unharmed(machine, 480)
+    unharmed(machine, EVENING + 120)
 
 
 async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,20 +107,20 @@ async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, mo
         Breaks(monkeypatch, Shadow, "process", always=True)
         Breaks(monkeypatch, Loop, "give_up", always=True)
 
-    machine.at_sample[420] = breaks
-    await machine.run(480)
+    machine.at_sample[EVENING + 60] = breaks
+    await machine.run(EVENING + 120)
     monkeypatch.undo()
     assert said(machine).endswith("the loop is off until the next start")
-    unharmed(machine, 480)
+    unharmed(machine, EVENING + 120)
 
 
 async def test_at_the_start_of_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    await machine.run(420)
+    await machine.run(EVENING + 60)
     broken = Breaks(monkeypatch, ModelLoop, "process")
     await machine.run(60)
     assert broken.calls > 1
     assert any("without its state: internal error: ZeroDiv" in event.text for event in machine.events("restart"))
     monkeypatch.undo()
-    unharmed(machine, 480)
+    unharmed(machine, EVENING + 120)
     checked(machine)

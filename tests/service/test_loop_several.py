@@ -40,7 +40,7 @@ from tests.service.looping import (
     together,
 )
 from tests.service.test_loop_level import WarmAtFirst, begun, warm_at_first
-from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
+from tests.service.test_loop_service import EVENING, Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 #: A diagnosis each eight hours, and none of them is adopted before the next one.
@@ -376,7 +376,7 @@ async def test_an_answer_to_a_candidate_that_has_given_its_place_is_refused(tmp_
         if core is not None and core.state.has_next and core.state.candidate is not None and asked.reply is None:
             asked()
 
-    await service.run(480)
+    await service.run(EVENING + 120)
     found = service.candidates()[-1]
     assert found.model_sha256 == sha256_of(extended())
     service.at_poll = between
