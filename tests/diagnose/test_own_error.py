@@ -122,7 +122,8 @@ def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(beside, helps, sha
 def changed():
     """A machine of which a time constant of 21 min became 16 min; its calibration has modes of 1, 49 and 396 min."""
     machine = next(c for c in _cases(260_000) if (c.family, c.seed) == ("transfer", 260_034)).draw()
-    return machine, tc.identify(machine.calibration.columns).model
+    # The order that `identify` finds; finding it takes longer than the fit.
+    return machine, tc.identify(machine.calibration.columns, order=(4, 4, 2)).model
 
 
 @pytest.fixture(scope="module")

@@ -172,10 +172,11 @@ async def test_a_sensor_that_was_moved_refuses_no_better_model(tmp_path: Path, m
     """By its values Y would speak for the weaker model; by its changes it speaks for the right one."""
     machine = Measured(tmp_path, more)
     await machine.run(900)
-    for present in (gain(0.1), gain(-0.1)):
-        assert machine.opinion(present, QUILL).verdict == "better"
-        assert machine.opinion(QUILL, present).verdict == "worse"
-    odd = [machine.opinion(QUILL, gain(change)) for change in (-0.1, 0.1)]
+    odd = []
+    for other in (gain(0.1), gain(-0.1)):
+        assert machine.opinion(other, QUILL).verdict == "better"
+        odd.append(machine.opinion(QUILL, other))
+        assert odd[-1].verdict == "worse"
     assert any(found.y_moved and "about the zero it looks otherwise" in described(found) for found in odd)
 
 
