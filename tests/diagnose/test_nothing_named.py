@@ -28,31 +28,49 @@ def day():
     return runs_from(columns | {"y_um": columns["y_um"] + 0.1 * wave(columns["y_um"].size)})
 
 
-def diagnosed(monkeypatch, remainder_um):
+@pytest.fixture(scope="module")
+def searched():
+    """Searches all of that day, and all but each of its blocks, once: the tests differ in what is made of it."""
+    kept = {}
+
+    def found_in(evidence, grid=None, **given):
+        key = evidence.used.tobytes(), *sorted(given.items())
+        if key not in kept:
+            kept[key] = findings_of(evidence, grid=grid, **given)
+        return kept[key]
+
+    return found_in
+
+
+def search_by(monkeypatch, found_in):
+    for module in (diagnosis, held_out):
+        monkeypatch.setattr(module, "findings_of", found_in)
+
+
+def diagnosed(monkeypatch, searched, remainder_um):
     """Diagnose that day with a remainder that is a wave of this size in every search."""
 
     def found_in(evidence, **given):
-        found = findings_of(evidence, **given)
+        found = searched(evidence, **given)
         assert not found.terms
         points = found.search.points
         fitted = Background(evidence).fitted(points, np.zeros(points.count), found.selection.before.rest)
         remainder = dataclasses.replace(fitted, added=remainder_um * wave(fitted.added.size))
         return dataclasses.replace(found, remainder=remainder, explains=True)
 
-    for module in (diagnosis, held_out):
-        monkeypatch.setattr(module, "findings_of", found_in)
+    search_by(monkeypatch, found_in)
     return diagnose(QUILL, day())
 
 
-def test_a_remainder_that_held_out_blocks_contradict_is_not_deployed(monkeypatch):
-    found = diagnosed(monkeypatch, -0.1)
+def test_a_remainder_that_held_out_blocks_contradict_is_not_deployed(monkeypatch, searched):
+    found = diagnosed(monkeypatch, searched, -0.1)
     table = figures(found)
     assert table["remainder"] is None and found.model.effects == ()
     assert table["verdict"] == "adequate" and table["after"] == table["before"]
 
 
-def test_a_model_that_gets_a_remainder_is_not_called_adequate(monkeypatch):
-    table = figures(diagnosed(monkeypatch, 0.1))
+def test_a_model_that_gets_a_remainder_is_not_called_adequate(monkeypatch, searched):
+    table = figures(diagnosed(monkeypatch, searched, 0.1))
     assert table["remainder"]["deployed"] and table["verdict"] == "unexplained"
     assert table["remainder"]["rms_before_um"] == pytest.approx(table["before"]["rms_um"], rel=1e-12)
     assert table["before"]["rms_um"] > table["after"]["rms_um"]
@@ -60,7 +78,7 @@ def test_a_model_that_gets_a_remainder_is_not_called_adequate(monkeypatch):
     assert table["advice"]["unexplained"]["kind"] == "remainder"
 
 
-def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequate(monkeypatch):
+def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequate(monkeypatch, searched):
     """An initial state of its slow modes may take in what acts, as far as the record that it is fitted to goes."""
     held_out_of = diagnosis.held_out_of
 
@@ -68,6 +86,7 @@ def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequa
         found = held_out_of(*given)
         return dataclasses.replace(found, nothing=10.0 * found.nothing)
 
+    search_by(monkeypatch, searched)
     assert figures(diagnose(QUILL, day()))["verdict"] == "adequate"
     monkeypatch.setattr(diagnosis, "held_out_of", foretold)
     found = diagnose(QUILL, day())
@@ -78,16 +97,15 @@ def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequa
     assert "does not foretell the rest" in verdict(table) and table["advice"]["unexplained"] is None
 
 
-def test_what_only_the_blocks_named_is_no_error_after(monkeypatch):
+def test_what_only_the_blocks_named_is_no_error_after(monkeypatch, searched):
     whole = diagnosis.evidence_of(QUILL, day()).count
 
     def found_in(evidence, **given):
-        found = findings_of(evidence, **given)
+        found = searched(evidence, **given)
         wrong = () if evidence.count == whole else (wave(found.ceiling.size),)
         return dataclasses.replace(found, responses=(*found.responses, *wrong))
 
-    for module in (diagnosis, held_out):
-        monkeypatch.setattr(module, "findings_of", found_in)
+    search_by(monkeypatch, found_in)
     table = figures(diagnose(QUILL, day()))
     assert table["effects"] == [] and table["remainder"] is None
     assert table["after"] == table["before"]

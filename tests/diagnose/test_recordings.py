@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import compensator as tc
-from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.held_out import left_of_block
@@ -65,15 +64,9 @@ def test_a_block_behind_a_gap_is_foretold_by_what_is_known_of_the_state_there():
     assert found.verdict == "explained" and found.after.rms_um < 0.6 * found.before.rms_um
 
 
-def test_the_diagnosis_says_how_it_was_measured():
-    _, runs = recordings(10.0, 8.0, 9.0)
-    found = diagnose(QUILL, runs)
-    assert [effect.place for effect in found.effects] == [("gain", "DTF", "")]
-    assert found.held_out.startswith("each of 3 recordings")
-    assert found.after.rms_um < 0.2 * found.before.rms_um
-
-
-def test_the_python_face_knows_recordings_by_their_files():
-    tables, _ = recordings(6.0, 5.0, 6.0)
-    data = [{"t_s": np.arange(t["y_um"].size) * 60.0, **t} for t in tables]
-    assert tc.diagnose(QUILL, data).to_dict()["held_out"].startswith("each of 3 recordings")
+def test_the_python_face_knows_recordings_by_their_files_and_says_how_it_was_measured():
+    tables, _ = recordings(10.0, 8.0, 9.0)
+    why = tc.diagnose(QUILL, [{"t_s": np.arange(t["y_um"].size) * 60.0, **t} for t in tables])
+    assert [effect.place for effect in why.effects] == [("gain", "DTF", "")]
+    assert why.to_dict()["held_out"].startswith("each of 3 recordings")
+    assert why.diagnosis.after.rms_um < 0.2 * why.diagnosis.before.rms_um
