@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.held_out import left_of_block

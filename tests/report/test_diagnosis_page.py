@@ -168,6 +168,9 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
     assert (first.searches, second.searches) == (3, 2)
+    # What the search without the first block does not find is left there, and nowhere else.
+    left = [float(np.nanstd(held_out.named[block])) for block in evidence.blocks(FOLDS)]
+    assert left == pytest.approx([1.0, 0.0, 0.0], abs=0.15)
     assert first.rms_um == pytest.approx(1.0, rel=0.15)
     assert second.rms_um == pytest.approx(math.sqrt(1.0 / 3.0), rel=0.15)
     assert second.rms_um == pytest.approx(rms_of(held_out.named))
