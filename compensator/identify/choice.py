@@ -27,6 +27,8 @@ from compensator.progress import Progress, unreported
 
 #: Time constants that differ by less than this share coincide.
 TWINS = 0.05
+#: What a fit has seen of a segment shows its zero and initial state from this share on.
+SEEN = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,30 @@ def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]
         ]
 
 
+def sees_start(segments: Sequence[Segment], part: Sequence[Segment], i: int) -> bool:
+    """Whether a part shows how a segment begins, or does not have to.
+
+    Of the first segment it has to: a calibration mostly begins at rest, and any other initial state must foretell the
+    block that hides it. How warm the machine is behind a gap nothing else shows.
+    """
+    return i == 0 or bool(part[i].used[np.argmax(segments[i].used)])
+
+
+def held_out_errors(fit: OutputErrorFit, segments: Sequence[Segment], part: Sequence[Segment]) -> Vector:
+    """Return the free-run errors of a fit to a part of the samples on those that it did not see.
+
+    A segment of which the part has less than `SEEN`, or not the beginning, shows its zero and initial state in its own
+    samples alone: they are fitted to these, and what is left is the error of the paths.
+    """
+    errors = [np.zeros(0)]
+    for i, (residual, whole, seen) in enumerate(zip(fit.residuals, segments, part, strict=True)):
+        held = whole.used & ~seen.used
+        if held.any():
+            is_known = seen.used.sum() >= SEEN * whole.used.sum() and (whole.rest or sees_start(segments, part, i))
+            errors.append((residual if is_known else fit.about_own_start(residual, whole))[held])
+    return np.concatenate(errors)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
     """A structure fitted to everything and, fold by fold, to the rest.
@@ -123,9 +149,7 @@ def tried(segments: Sequence[Segment], structure: Structure, period_s: float, fo
     for part in folds_of(segments, folds):
         if sum(int(segment.used.sum()) for segment in part) == 0:
             continue
-        residuals = fit(part, structure, period_s, warm=whole.taus_min.tolist()).residuals
-        held_out = [s.used & ~p.used for s, p in zip(segments, part, strict=True)]
-        errors.append(np.concatenate([r[h] for r, h in zip(residuals, held_out, strict=True)]))
+        errors.append(held_out_errors(fit(part, structure, period_s, warm=whole.taus_min.tolist()), segments, part))
     return Tried(structure=structure, whole=whole, errors=tuple(e for e in errors if e.size))
 
 

@@ -232,6 +232,12 @@ class OutputErrorFit:
         """Return the fitted zero of a segment's output."""
         return float(self.nuisances[segment][-1]) if self.structure.offset else 0.0
 
+    def about_own_start(self, residual: Vector, segment: Segment) -> Vector:
+        """Return the residual of a segment less what its zero and initial state explain of its samples used."""
+        table = _nuisance_columns(segment, poles_of(self.taus_min, self.period_s), self.structure)
+        own = np.linalg.lstsq(table[segment.used], residual[segment.used], rcond=None)[0]
+        return np.asarray(residual - table @ own)
+
     def _first(self, j: int) -> int:
         return sum(self.structure.terms[:j])
 

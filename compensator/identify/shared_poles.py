@@ -22,7 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.calibration import Calibration, with_deformation
-from compensator.identify.choice import Candidate, folds_of, is_supported
+from compensator.identify.choice import Candidate, folds_of, held_out_errors, is_supported
 from compensator.identify.output_error import (
     OutputErrorFit,
     Segment,
@@ -261,8 +261,7 @@ def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: f
     errors: list[list[Vector]] = [[] for _ in each]
     for parts in zip(*(folds_of(one.segments, folds) for one in each), strict=True):
         for own, one, part, fit in zip(errors, each, parts, fits_of(parts, [whole[0].taus_min.tolist()]), strict=True):
-            held_out = [s.used & ~p.used for s, p in zip(one.segments, part, strict=True)]
-            own.append(np.concatenate([r[h] for r, h in zip(fit.residuals, held_out, strict=True)]))
+            own.append(held_out_errors(fit, one.segments, part))
     candidates = {}
     for axis, one, own, fit, kind in zip(outputs, each, errors, whole, structures, strict=True):
         candidates[axis] = Candidate(

@@ -121,6 +121,17 @@ def test_a_run_that_begins_after_fit_until_is_held_out_as_a_whole():
     assert criticise(result).warnings
 
 
+@pytest.mark.parametrize("gap", [slice(480, 590), slice(640, 750)])
+def test_behind_a_gap_the_error_is_that_of_the_paths(gap):
+    """The state of the machine there is seen in no other block; the noise is 0.3 µm."""
+    columns = table_columns() | {"heat_w": VALIDATION_W}
+    for name in ("t_q_degc", "at_degc"):
+        columns[name][gap] = np.nan
+    result = calibrate(runs_from(columns), Settings(order=(3, 3, 2), drive="known"), period_s=60.0, name="x")
+    assert len(result.runs) == 2
+    assert result.model.held_out_rms_um < 0.5
+
+
 def table_columns():
     _, ambient, difference, y, _, _ = published(VALIDATION_W, 3)
     return {"t_q_degc": 21.0 + ambient + difference, "at_degc": 21.0 + ambient, "y_um": y}
