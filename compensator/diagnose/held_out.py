@@ -15,7 +15,7 @@ from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.likelihood import RandomColumns
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
 from compensator.diagnose.own_error import own_error_alone
-from compensator.diagnose.points import ZERO_TIMES, Points, Rest
+from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.hypothesis import Place
@@ -167,10 +167,8 @@ class _Nuisances:
 
     def __init__(self, points: Points, rest: Rest) -> None:
         self._points, self._whitening = points, Whitening(points, rest)
-        table, is_zero = points.evidence.nuisances, points.is_zero
-        zero_um = ZERO_TIMES * points.spread_um
-        self._table = np.concatenate([zero_um * table[:, is_zero], rest.start_um * table[:, ~is_zero]], axis=1)
-        self._white = self._whitening.of(self._points.averaged(self._table))
+        self._table = points.nuisances(rest)
+        self._white = self._whitening.of(points.averaged(self._table))
 
     def beside(self, added: Vector) -> Vector:
         """Return what effects add, with the most probable zeros and initial states beside them, on every sample."""
