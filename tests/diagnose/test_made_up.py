@@ -191,6 +191,7 @@ def test_it_is_said_why_nothing_is_deployed() -> None:
 def test_paths_fitted_anew_beside_nothing_are_not_deployed() -> None:
     """Six hours of a machine whose T_Q lies; the gains of the two paths change their sign, and nothing has a name."""
     machine, base = drawn("conduction", 300_021)
+    base = dataclasses.replace(base, held_out_rms_um=3.0)  # so much is far off: nothing is known of the paths
     why = tc.diagnose(base, machine.record.columns)
     assert why.verdict == "unexplained" and why.effects == ()
     assert (why.model.dtf, why.model.tdtf, why.model.effects) == (base.dtf, base.tdtf, base.effects)
