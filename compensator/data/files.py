@@ -21,7 +21,7 @@ from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.data import mat_reader
 from compensator.data.cells import text_of, with_points
 from compensator.data.frames import table_in_memory
-from compensator.data.mat_reader import CELLS, DAMAGED
+from compensator.data.mat_reader import DAMAGED
 from compensator.data.table import DATA_ROLES, TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Probe, number
@@ -37,8 +37,8 @@ _OTHER_FILES = (
     (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
-#: Largest table beside its cells, each of which takes some hundred bytes while it is read: bytes of its file, and rows.
-TABLE_BYTES, ROWS = 1_000_000_000, 10_000_000
+#: Largest table: bytes of its file, rows, and cells; each cell takes some hundred bytes while it is read.
+TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 10_000_000, 50_000_000
 #: Longest that the largest MAT file takes to read on a loaded computer, s.
 _MAT_S = 300.0
 #: First line by which Excel names the separator.

@@ -15,14 +15,16 @@ import zlib
 #: What scipy raises for a damaged file besides its own error, and pandas for a damaged workbook.
 DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 
-#: Cells of the largest table, and the memory that reading one takes at most, bytes: a packed file of a few megabytes
-#: can ask for a thousand times as much.
-CELLS, MEMORY_BYTES = 50_000_000, 4_000_000_000
+#: Memory that reading a file takes at most, and what is read of it, bytes: a packed file of a few megabytes can ask for
+#: a thousand times as much.
+MEMORY_BYTES, READ_BYTES = 4_000_000_000, 1_000_000_000
 
 
 def main() -> None:
     """Read the file that the argument names."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    allowed = min((limit for limit in limits if limit != resource.RLIM_INFINITY), default=MEMORY_BYTES)
+    resource.setrlimit(resource.RLIMIT_AS, (min(MEMORY_BYTES, allowed), limits[1]))
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
@@ -33,8 +35,8 @@ def main() -> None:
     except (NotImplementedError, MatReadError, *DAMAGED) as error:
         found = error
     data = pickle.dumps(found)
-    if len(data) > 8 * CELLS:
-        data = pickle.dumps(ValueError(f"more than {CELLS} values"))
+    if len(data) > READ_BYTES:
+        data = pickle.dumps(ValueError(f"more than {READ_BYTES} bytes of values"))
     sys.stdout.buffer.write(data)
 
 

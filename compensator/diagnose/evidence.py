@@ -201,7 +201,7 @@ class Evidence:
 
     def with_initial_state(self, initial_um: Vector) -> Evidence:
         """Return the evidence with what the initial state of the paths adds on every sample, µm."""
-        parts = np.split(initial_um, np.cumsum([record.size for record in self.signals])[:-1])
+        parts = [initial_um[run] for run in self.samples_of_runs()]
         signals = [dataclasses.replace(own, initial_um=part) for own, part in zip(self.signals, parts, strict=True)]
         return dataclasses.replace(self, signals=tuple(signals))
 

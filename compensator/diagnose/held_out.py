@@ -42,6 +42,8 @@ WITH_PATHS = "; before: the paths of the first model alone, also refitted to the
 class HeldOut:
     """What is left on every sample by estimates that did not see it, µm; NaN where y is missing.
 
+    All data say only how large noise, slow rest and initial states are.
+
     `base` is left by the base's paths as they are, of which the other blocks set the zero and initial state only.
     """
 
@@ -78,11 +80,11 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     )
     left = np.full((7 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
-    for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
+    for done, (block, several) in enumerate(zip(blocks, predicted, strict=True), start=2):
         progress(done, len(blocks) + 1)
         searches += several.has
         for i, one in enumerate(several.predicted):
-            left[i, block] = left_of_block(evidence, block, seen, one)
+            left[i, block] = left_of_block(evidence, block, several.knows_zero, one)
     # Nothing is given the better of both: a rest without effects may be that of the effects, and go anywhere.
     base, nothing = min(left[:2], left[2:4], key=lambda each: rms_of(each[1]))
     named, whole, ceiling, *steps = left[4:]
@@ -96,13 +98,19 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     )
 
 
-def left_of_block(evidence: Evidence, block: Mask, seen: Evidence, predicted: Vector) -> Vector:
-    """Return what a prediction leaves of a block, µm; a run of which nothing was seen is about its own mean."""
+def left_of_block(evidence: Evidence, block: Mask, knows_zero: Sequence[bool], predicted: Vector) -> Vector:
+    """Return what a prediction leaves of a block, µm; a run whose zero it does not know is about its own mean."""
     left = np.where(block, evidence.residual - predicted, np.nan)
-    for run in evidence.samples_of_runs():
-        if block[run].any() and not seen.used[run].any():
+    for run, is_known in zip(evidence.samples_of_runs(), knows_zero, strict=True):
+        if block[run].any() and not is_known:
             left[run] -= np.nanmean(left[run])
     return np.asarray(left[block])
+
+
+def zeros_known(points: Points) -> tuple[bool, ...]:
+    """Return for each run whether a point shows its zero; a few samples at its end are none."""
+    first, runs = points.first, points.evidence.samples_of_runs()
+    return tuple(bool(np.any((first >= run.start) & (first < run.stop))) for run in runs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,11 +123,14 @@ class _Predictions:
         Of the base's paths as they are and nothing, with the rest without effects; both again, the named effects,
         effects and remainder, all channels, the first place, the first two, …, with the rest beside effects; µm, each
         with the zeros and initial states that are most probable beside it.
+    knows_zero : tuple of bool
+        For each run whether it knows its zero.
     has : numpy.ndarray of int, shape (places,)
         1 where it found an effect of that place.
     """
 
     predicted: tuple[Vector, ...]
+    knows_zero: tuple[bool, ...]
     has: Indices
 
 
@@ -150,7 +161,11 @@ def _predictions(
     beside, alone = (_Nuisances(found.search.points, rest).beside for rest in rests)
     nothing = by_base(seen) + of_time, found.paths
     added = (found.named, whole, found.ceiling, *steps)
-    return _Predictions(predicted=(*map(alone, nothing), *map(beside, (*nothing, *added))), has=has)
+    return _Predictions(
+        predicted=(*map(alone, nothing), *map(beside, (*nothing, *added))),
+        knows_zero=zeros_known(found.search.points),
+        has=has,
+    )
 
 
 class _Nuisances:
@@ -167,8 +182,8 @@ class _Nuisances:
 
     def __init__(self, points: Points, rest: Rest) -> None:
         self._points, self._whitening = points, Whitening(points, rest)
-        self._table = points.nuisances(rest)
-        self._white = self._whitening.of(points.averaged(self._table))
+        self._table = points.zeros_and_starts(rest)
+        self._white = self._whitening.of(points.random(rest)[:, : self._table.shape[1]])
 
     def beside(self, added: Vector) -> Vector:
         """Return what effects add, with the most probable zeros and initial states beside them, on every sample."""

@@ -250,8 +250,8 @@ class Points:
         forms = tuple((channel, share * size) for channel, size in sizes_um.items() if channel)
         return dataclasses.replace(rest, own_um=math.hypot(self.own_um, share * sizes_um.get("", 0.0)), forms=forms)
 
-    def nuisances(self, rest: Rest) -> Matrix:
-        """Return zeros and initial states on every sample, the first columns of `random`: weights of size 1."""
+    def zeros_and_starts(self, rest: Rest) -> Matrix:
+        """Return the first columns of `random`, zeros and initial states, on every sample."""
         table, zero_um = self.evidence.nuisances, ZERO_TIMES * self.spread_um
         return np.concatenate([zero_um * table[:, self.is_zero], rest.start_um * table[:, ~self.is_zero]], axis=1)
 

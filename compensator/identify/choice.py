@@ -1,8 +1,9 @@
 """Order selection: the number of modes, by the free-run error on held-out blocks.
 
 A fold is a block of time whose measured deformation is held out while the model is fitted to the other blocks; the
-model runs through it, because its inputs are known. The simplest structure is chosen whose held-out error exceeds the
-smallest by at most one standard error. Structures whose amplitudes the data do not determine are excluded.
+model runs through it, because its inputs are known. Only the initial state behind a gap may be taken from it. The
+simplest structure is chosen whose held-out error exceeds the smallest by at most one standard error. Structures whose
+amplitudes the data do not determine are excluded.
 
 Where Y was measured now and then, blocks have few values and differ by chance; the structure is then chosen by Akaike's
 information criterion, corrected for few values (Hurvich and Tsai, Biometrika 1989).
@@ -107,7 +108,7 @@ def held_out_errors(fit: OutputErrorFit, segments: Sequence[Segment], part: Sequ
     """Return the free-run errors of a fit to a part of the samples on those that it did not see.
 
     A segment of which the part has less than `SEEN`, or not the beginning, shows its zero and initial state in its own
-    samples alone: they are fitted to these, and what is left is the error of the paths.
+    samples alone: they are fitted to these. What is left is the error of the paths, less what a state takes in.
     """
     errors = [np.zeros(0)]
     for i, (residual, whole, seen) in enumerate(zip(fit.residuals, segments, part, strict=True)):
@@ -130,11 +131,14 @@ class Tried:
         The fit to everything.
     errors : tuple of numpy.ndarray
         Free-run errors on each fold of the fit to the other folds.
+    sees_start : tuple of (tuple of bool)
+        For each fold and each segment `sees_start`.
     """
 
     structure: Structure
     whole: OutputErrorFit
     errors: tuple[Vector, ...]
+    sees_start: tuple[tuple[bool, ...], ...]
 
     @property
     def fold_rms(self) -> tuple[float, ...]:
@@ -145,12 +149,15 @@ class Tried:
 def tried(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Tried:
     """Fit a structure to everything, and to all but one fold after another."""
     whole = fit(segments, structure, period_s)
-    errors = []
+    errors, seen = [], []
     for part in folds_of(segments, folds):
         if sum(int(segment.used.sum()) for segment in part) == 0:
             continue
-        errors.append(held_out_errors(fit(part, structure, period_s, warm=whole.taus_min.tolist()), segments, part))
-    return Tried(structure=structure, whole=whole, errors=tuple(e for e in errors if e.size))
+        found = held_out_errors(fit(part, structure, period_s, warm=whole.taus_min.tolist()), segments, part)
+        if found.size:
+            errors.append(found)
+            seen.append(tuple(sees_start(segments, part, i) for i in range(len(segments))))
+    return Tried(structure=structure, whole=whole, errors=tuple(errors), sees_start=tuple(seen))
 
 
 def choose(

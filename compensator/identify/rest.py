@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from itertools import compress
 
-from compensator.identify.choice import Tried, folds_of, no_worse, sees_start, tried
+from compensator.identify.choice import Tried, no_worse, tried
 from compensator.identify.output_error import Segment, Structure
 
 
@@ -39,13 +39,12 @@ def settle_starts(
     """
     kept = [dataclasses.replace(segment, rest=False) for segment in segments]
     free = tried(kept, structure, period_s, folds)
-    parts = list(folds_of(segments, folds))
     for i, segment in enumerate(kept):
         trial = [*kept[:i], dataclasses.replace(segment, rest=True), *kept[i + 1 :]]
         fixed = tried(trial, structure, period_s, folds)
         # A block that hides how it began says nothing of that.
-        judges = [sees_start(segments, part, i) for part in parts]
+        judges = [each[i] for each in free.sees_start]
         fixed_rms, free_rms = (list(compress(one.fold_rms, judges)) for one in (fixed, free))
-        if no_worse(fixed_rms, free_rms):
+        if not fixed_rms or no_worse(fixed_rms, free_rms):
             kept, free = trial, fixed
     return kept, free

@@ -9,7 +9,8 @@ import compensator as tc
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.held_out import left_of_block
+from compensator.diagnose.held_out import left_of_block, zeros_known
+from compensator.diagnose.points import Points
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
@@ -50,7 +51,9 @@ def test_a_recording_does_not_foretell_itself():
     assert findings_of(disturbed.without(mask)).whole == pytest.approx(predicted, abs=1e-9)
     # Its zero is its own mean, and no shift of it counts.
     shifted = dataclasses.replace(evidence, residual=evidence.residual + 50.0 * mask)
-    left, other = (left_of_block(each, mask, evidence.without(mask), predicted) for each in (evidence, shifted))
+    known = zeros_known(Points(evidence.without(mask)))
+    assert sum(known) == 2
+    left, other = (left_of_block(each, mask, known, predicted) for each in (evidence, shifted))
     assert left == pytest.approx(other, abs=1e-6) and abs(left.mean()) < 1e-6
 
 

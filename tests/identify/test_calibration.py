@@ -10,6 +10,8 @@ from compensator.errors import DataError
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.comparison import compare
 from compensator.identify.criticism import criticise
+from compensator.identify.output_error import Segment, Structure
+from compensator.identify.rest import settle_starts
 from compensator.identify.settings import Settings
 from compensator.identify.temperature import fit_temperature, noise_gain
 from compensator.model.thermal_model import check_inverse
@@ -130,6 +132,18 @@ def test_behind_a_gap_the_error_is_that_of_the_paths(gap):
     result = calibrate(runs_from(columns), Settings(order=(3, 3, 2), drive="known"), period_s=60.0, name="x")
     assert len(result.runs) == 2
     assert result.model.held_out_rms_um < 0.5
+
+
+def test_a_segment_without_y_says_nothing_of_how_it_begins():
+    columns = table_columns()
+    for name in ("t_q_degc", "at_degc"):
+        columns[name][480:590] = np.nan
+    columns["y_um"][590:] = np.nan
+    runs = runs_from(columns)
+    data = [Segment.of([run.difference_k, run.ambient_k], run.y_um) for run in runs]
+    segments, found = settle_starts(data, Structure(order=2, terms=(2, 2)), 60.0, 5)
+    assert [segment.used.any() for segment in segments] == [True, False]
+    assert len(found.fold_rms) == 5 and all(np.isfinite(found.fold_rms))
 
 
 def table_columns():
