@@ -23,6 +23,8 @@ ROUNDED = 2e-9
 NOTHING_IN_IT = "recording"
 #: It chose its structure by blocks that were predicted with any state behind a gap of 100 min: 4.7 µm rms.
 WITH_A_GAP = "direct"
+#: Gains at rest of its DTF and TDTF since then.
+GAINS_WITH_A_GAP = [4.5474, 13.8375]
 
 
 def check(wanted: Any, found: Any, rel: float = 0.0, corrected: tuple[str, ...] = ()) -> None:
@@ -115,6 +117,8 @@ def test_identify(name: str, tmp_path: Path) -> None:
     if name == WITH_A_GAP:
         assert set(wanted["result"]) <= set(result)
         assert result["folds_rms_um"] < 0.1 * wanted["result"]["folds_rms_um"]
+        gains = [result["paths"][path]["gain"]["value"] for path in ("DTF", "TDTF")]
+        assert gains == pytest.approx(GAINS_WITH_A_GAP, rel=1e-3)
         assert all(now["rms_um"] < 0.6 < before["rms_um"] for before, now in _parts(wanted["result"], result))
         return
     check(wanted["result"], result, FITTED)
