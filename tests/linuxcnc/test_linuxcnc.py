@@ -14,7 +14,7 @@ import pytest
 from tests.linuxcnc.control import NAMESPACES, ROOT, STARTS, STARVED, is_starved, why_not
 from tests.linuxcnc.several import waited
 
-#: What the component says where the position has changed by more between two of its turns than the axis can move in one.
+#: What the component says where the position has changed by more between two of its turns than the axis can move.
 TABLE_JUMPED = "[position_jumped]"
 REASON = why_not()
 pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(860)]
