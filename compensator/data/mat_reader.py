@@ -23,8 +23,8 @@ MEMORY_BYTES, READ_BYTES = 4_000_000_000, 1_000_000_000
 def main() -> None:
     """Read the file that the argument names."""
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    allowed = min((limit for limit in limits if limit != resource.RLIM_INFINITY), default=MEMORY_BYTES)
-    resource.setrlimit(resource.RLIMIT_AS, (min(MEMORY_BYTES, allowed), limits[1]))
+    least = min([MEMORY_BYTES, *(limit for limit in limits if limit != resource.RLIM_INFINITY)])
+    resource.setrlimit(resource.RLIMIT_AS, (least, limits[1]))
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 

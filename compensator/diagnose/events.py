@@ -150,10 +150,9 @@ def follows_day(evidence: Evidence, course: Vector) -> bool:
 def steepest(evidence: Evidence, course: Vector, count: int = 12) -> list[Time]:
     """Return when a course that is no switching moves fastest: record and time, min, apart from each other."""
     found: list[tuple[float, Time]] = []
-    period_min, begin = evidence.context.period_min, 0
-    for record in evidence.signals:
-        part = course[begin : begin + record.size]
-        begin += record.size
+    period_min = evidence.context.period_min
+    for record, run in zip(evidence.signals, evidence.samples_of_runs(), strict=True):
+        part = course[run]
         wide = max(2, record.size // 200)
         slope = np.abs(part[wide:] - part[:-wide])
         least = 0.5 * float(slope.max(initial=0.0))

@@ -178,9 +178,8 @@ class Evidence:
 
     def samples_of_runs(self) -> list[slice]:
         """Return where the samples of each run are."""
-        return list(
-            itertools.starmap(slice, itertools.pairwise(np.cumsum([0, *[s.size for s in self.signals]]).tolist()))
-        )
+        ends = np.cumsum([0, *(record.size for record in self.signals)]).tolist()
+        return [slice(first, end) for first, end in itertools.pairwise(ends)]
 
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""

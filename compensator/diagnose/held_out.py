@@ -183,7 +183,7 @@ class _Nuisances:
     def __init__(self, points: Points, rest: Rest) -> None:
         self._points, self._whitening = points, Whitening(points, rest)
         self._table = points.zeros_and_starts(rest)
-        self._white = self._whitening.of(points.random(rest)[:, : self._table.shape[1]])
+        self._white = self._whitening.of(points.averaged(self._table))
 
     def beside(self, added: Vector) -> Vector:
         """Return what effects add, with the most probable zeros and initial states beside them, on every sample."""

@@ -337,21 +337,19 @@ def _ends(evidence: Evidence) -> Mask:
     They take part in no comparison, so that every explanation is compared on the same samples. A value that was
     measured now and then is not given up, and where the model corrects a late T_Q already the engine uses no future.
     """
-    ends, first = np.zeros(evidence.used.size, dtype=bool), 0
-    for record, is_sparse in zip(evidence.signals, evidence.sparse, strict=True):
+    ends = np.zeros(evidence.used.size, dtype=bool)
+    for record, run, is_sparse in zip(evidence.signals, evidence.samples_of_runs(), evidence.sparse, strict=True):
         minutes = min(ENDS_MIN, ENDS_SHARE * record.size * record.period_min)
         if not is_sparse and evidence.model.late_t_q is None:
-            ends[first + record.size - round(minutes / record.period_min) : first + record.size] = True
-        first += record.size
+            ends[run.stop - round(minutes / record.period_min) : run.stop] = True
     return ends
 
 
 def _edges(evidence: Evidence, stride: int) -> list[Indices]:
     """Return the first sample of each point, for each run; a value measured now and then is a point of its own."""
-    starts = np.cumsum([0, *[record.size for record in evidence.signals[:-1]]])
     return [
-        s + np.flatnonzero(evidence.used[s : s + record.size]) if sparse else np.arange(s, s + record.size, stride)
-        for s, record, sparse in zip(starts.tolist(), evidence.signals, evidence.sparse, strict=True)
+        run.start + np.flatnonzero(evidence.used[run]) if sparse else np.arange(run.start, run.stop, stride)
+        for run, sparse in zip(evidence.samples_of_runs(), evidence.sparse, strict=True)
     ]
 
 

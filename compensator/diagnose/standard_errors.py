@@ -188,10 +188,9 @@ def _time_error(fit: Fit, index: int, by_slope: float) -> float:
 
 def _intervals(fit: Fit) -> tuple[Vector, Vector]:
     """Return begin and end of every interval between two values of a run, min after the start of the first run."""
-    evidence, begins, ends, first = fit.likelihood.points.evidence, [], [], 0
-    for record in evidence.signals:
-        minutes = (record.begins_min + record.minutes)[evidence.used[first : first + record.size]]
+    evidence, begins, ends = fit.likelihood.points.evidence, [], []
+    for record, run in zip(evidence.signals, evidence.samples_of_runs(), strict=True):
+        minutes = (record.begins_min + record.minutes)[evidence.used[run]]
         begins.append(minutes[:-1])
         ends.append(minutes[1:])
-        first += record.size
     return np.concatenate(begins), np.concatenate(ends)

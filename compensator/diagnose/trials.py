@@ -261,8 +261,8 @@ class Trials:
         return np.concatenate([self._filtered(u - u[0]) for u in self._by_run(name)])
 
     def _by_run(self, name: str) -> list[Vector]:
-        cuts = np.cumsum([record.size for record in self.evidence.signals])[:-1]
-        return np.split(self._recorded(name), cuts)
+        values = self._recorded(name)
+        return [values[run] for run in self.evidence.samples_of_runs()]
 
     @cached_property
     def _followers(self) -> Mapping[str, Mapping[str, Vector]]:

@@ -67,7 +67,8 @@ def test_a_fluid_whose_temperature_does_not_move_is_one():
     found = findings_of(evidence_of(QUILL, runs_from(columns)))
     [term] = found.terms
     assert term.effect.channels == ("coolant_lpm", "coolant_degc")
-    assert found.rest_um < 0.35
+    # With the noise of 0.3 µm 0.35 is left.
+    assert np.hypot(found.rest_um, 0.3) < 0.35
 
 
 @pytest.mark.parametrize(("channel", "name"), [("a_rpm", "_rpm"), ("a_l_per_min", "_l_per_min"), ("coolant_flow", "")])

@@ -68,6 +68,17 @@ def test_a_block_behind_a_gap_is_foretold_by_what_is_known_of_the_state_there():
     assert found.verdict == "explained" and found.after.rms_um < 0.6 * found.before.rms_um
 
 
+@pytest.mark.parametrize("start", [688, 1359])
+def test_a_run_of_which_a_few_samples_are_seen_is_about_its_own_mean(start):
+    """Its last eight minutes make no point, nor does a single sample; the zero of Y is 100 µm away."""
+    columns, _, _ = record([], 80, 36.0)
+    for name in ("t_q_degc", "at_degc"):
+        columns[name][start : start + 120] = np.nan
+    columns["y_um"] += 100.0
+    found = diagnose(QUILL, runs_from(columns))
+    assert found.before.rms_um < 10.0
+
+
 def test_the_python_face_knows_recordings_by_their_files_and_says_how_it_was_measured():
     tables, _ = recordings(10.0, 8.0, 9.0)
     why = tc.diagnose(QUILL, [{"t_s": np.arange(t["y_um"].size) * 60.0, **t} for t in tables])
