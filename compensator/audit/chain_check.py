@@ -65,8 +65,9 @@ class ChainCheck:
     ) -> None:
         self._contents, self._result, self._verifier = contents, result, verifier
         self._heads = frozenset(map(bytes.fromhex, heads))
-        #: Time of the last valid signature or of the start of the file, and whether the next record must be a seal.
-        self._signed_ns, self._due, self._due_ns = 0, False, 0
+        #: Time of the last valid signature or of the start of the file; whether the next group must be a seal, and
+        #: whether this one must.
+        self._signed_ns, self._due, self._is_late = 0, False, False
         #: Times of the last record that a signature or the head covers, and of the last record.
         self._covered_ns = self._last_ns = 0
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
@@ -99,6 +100,7 @@ class ChainCheck:
                 self._next = sequence + 1
                 return
         result, value, number, entries = self._result, self.head, self._next, []
+        self._is_late = self._due
         if result.seal and not records:
             result.find(Fault.BEHIND_SEAL, message)
         whole = True
@@ -129,6 +131,7 @@ class ChainCheck:
     def add_rest(self, records: list[RawRecord]) -> None:
         """Count the records after the last `/chain` message: the file ends within a group."""
         result = self._result
+        self._is_late = self._due
         for record in records:
             self.head = chain.link(self.head, record.topic, record.body)
             result.seal, result.sealed_signed = "", False
@@ -346,28 +349,29 @@ class ChainCheck:
     def _add_unsigned(self, topic: str, time_ns: int, body: bytes) -> None:
         """Count a record that no signature covers yet.
 
-        A sample counts by its own time, too, which is that of its group: without a signature either can be rewritten.
+        It counts by its own time, too: without a signature either can be rewritten. That of a sample is that of its
+        group; what is reported late, such as a probe, may have been measured long before.
         """
         result = self._result
         result.unsigned_behind += 1
         result.unsigned_samples += topic == "sample"
-        own = _TIME.search(body) if topic == "sample" else None
-        if own is not None:
+        result.unsigned_offsets += topic == "offset"
+        own = _TIME.search(body)
+        if own is not None and (topic == "sample" or int(own[1]) > self._signed_ns):
             time_ns = max(time_ns, int(own[1]), key=lambda ns: abs(ns - self._signed_ns))
         age_ns, self._last_ns = abs(time_ns - self._signed_ns), time_ns
-        result.unsigned_min = abs(time_ns - self._covered_ns) / 60e9
-        # The recorder writes a seal in the same group of bytes as the first records for which one is due.
-        result.overdue = result.overdue or (self._due and time_ns != self._due_ns)
-        if age_ns >= chain.SEAL_EVERY_NS and not self._due:
-            self._due, self._due_ns = True, time_ns
+        result.unsigned_min = max(result.unsigned_min, abs(time_ns - self._covered_ns) / 60e9)
+        # After the group with which a seal is due the recorder writes nothing before that seal.
+        result.overdue = result.overdue or (self._is_late and topic != "seal")
+        self._due = self._due or age_ns >= chain.SEAL_EVERY_NS
 
     def _covered(self, time_ns: int) -> None:
         """Note that everything up to here is signed."""
         result = self._result
-        result.unsigned_behind = result.unsigned_samples = 0
+        result.unsigned_behind = result.unsigned_samples = result.unsigned_offsets = 0
         result.unsigned_min, result.overdue = 0.0, False
         self._signed_ns = self._covered_ns = time_ns
-        self._due = False
+        self._due = self._is_late = False
 
     def _compare_head(self, value: bytes) -> None:
         """Note whether the machine's head states this value: then it covers everything up to here."""

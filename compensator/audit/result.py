@@ -34,10 +34,10 @@ class RecordingAudit:
         The first findings, and the number of all findings.
     records : int
         Records in the chain.
-    signed, unsigned_behind, unsigned_samples : int
-        Signed seals, and records and samples after the last of them that is valid.
+    signed, unsigned_behind, unsigned_samples, unsigned_offsets : int
+        Signed seals, and records, samples and offsets after the last of them that is valid.
     unsigned_min : float
-        Time from that seal, or from the start of the file, to its last record, min.
+        Time from that seal, or from the start of the file, to the record that is furthest from it, min.
     overdue : bool
         Whether a seal was due in that time: the recorder would not have gone on without it.
     at_head : bool
@@ -87,6 +87,7 @@ class RecordingAudit:
     signed: int = 0
     unsigned_behind: int = 0
     unsigned_samples: int = 0
+    unsigned_offsets: int = 0
     unsigned_min: float = 0.0
     overdue: bool = False
     at_head: bool = False
@@ -116,10 +117,10 @@ class RecordingAudit:
     def may_be_live(self) -> bool:
         """Whether it ends as a file may that is being written: without its end, and before the next seal is due.
 
-        The number of samples is bounded as well, because times can be rewritten; it is not bounded to one interval,
-        because the clock may have been set back.
+        The number of samples and of offsets is bounded as well, because times can be rewritten; it is not bounded to
+        one interval, because the clock may have been set back.
         """
-        unsigned_ns = self.unsigned_samples * self.period_s * NS
+        unsigned_ns = max(self.unsigned_samples, self.unsigned_offsets) * self.period_s * NS
         recent = not self.overdue and unsigned_ns <= 2 * SEAL_EVERY_NS
         return recent and self.end in (RecordingEnd.OPEN, RecordingEnd.TORN)
 

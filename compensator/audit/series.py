@@ -276,8 +276,8 @@ def _named(file: RecordingAudit) -> RecordingAudit:
 
 
 def _started(original: str) -> tuple[str, int]:
-    """Return the part of a file's name that shows when it was started."""
-    return order_of(original.removesuffix(".mcap").rpartition("_")[2])
+    """Return the part of a file's name that shows when it was started; a name that no recorder gives is the oldest."""
+    return order_of(original.removesuffix(".mcap").rpartition("_")[2]) if named_of(original) else ("", 0)
 
 
 class _Series:
@@ -293,7 +293,10 @@ class _Series:
         begun = [file for file in files if file.last] or files
         self._newest = {file.machine: file.file for file in begun}
         #: Only the file that was started last may still be without its next seal; a head states which one that is.
-        self._live = newest or (max(begun, key=lambda file: _started(file.original)).file if begun else "")
+        #: It is of a machine of which something is signed, if anything is: the key is that of one machine.
+        of = {file.machine for file in begun if file.signed}
+        own = [file for file in begun if file.machine in of] or begun
+        self._live = newest or (max(own, key=lambda file: _started(file.original)).file if own else "")
         self._signed = signed
         self.remarks: list[Remark] = []
 

@@ -23,7 +23,10 @@ def verdict(found: Audit) -> str:
     if partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
     words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
-    return words + (", signed with the given key." if found.signed else "; no signature was checked.")
+    if not found.signed:
+        return words + "; no signature was checked."
+    behind = sum(file.unsigned_samples for file in found.files)
+    return words + ", signed with the given key" + (f" but for the last {behind} of them." if behind else ".")
 
 
 def partly(found: Audit) -> bool:

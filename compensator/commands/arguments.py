@@ -9,6 +9,7 @@ from pathlib import Path
 from compensator.commands.outputs import (
     Reads,
     Writes,
+    check_diagnosis,
     files_of_diagnosis,
     page_of_calibration,
     page_of_report,
@@ -212,7 +213,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--model", type=_READ_TEXT, required=True, help="a model file, or quill")
     add(
         "--out",
-        type=Writes("", files_of_diagnosis),
+        type=Writes("", files_of_diagnosis, check_diagnosis),
         required=True,
         metavar="DIR",
         help="folder for diagnosis.json, model.toml, report.html and series.csv",

@@ -55,12 +55,15 @@ class Writes:
         Ending of such a file, `.csv` or `.toml`; `.html` for a page in any format; empty for a folder.
     also : callable
         Return what is written beside it, or in it, under names of their own.
+    check : callable
+        Refuse a path, which is given with its option, for a reason of its own.
     default : callable, optional
         Return the path from all arguments where it is not given; without, nothing is written then.
     """
 
     ending: str
     also: Callable[[Path], Iterable[Path]] = lambda path: ()
+    check: Callable[[Path, str], None] = lambda path, option: None
     default: Callable[[argparse.Namespace], Path] | None = None
 
     def __call__(self, text: str) -> Path:
@@ -95,6 +98,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         for file in kind.also(path):
             _check_apart(file, f"{option} {path}:", file.suffix, taken)
             _check_file(file, f"{option} {path}:", file.suffix)
+        kind.check(path, option)
 
 
 def pages_text(page: Path, also: Path | None) -> str:
@@ -115,6 +119,16 @@ def files_of_diagnosis(folder: Path) -> list[Path]:
 
     # Of several axes each has curves of its own.
     return [*(folder / name for name in FILES), *folder.glob("series-*.csv")]
+
+
+def check_diagnosis(folder: Path, option: str) -> None:
+    """Refuse a folder that has files of these names without the page that a diagnosis writes beside them."""
+    there = [path.name for path in files_of_diagnosis(folder) if path.exists()]
+    page = folder / "report.html"
+    if there and page.name not in there:
+        raise UsageError(
+            f"{option} {folder}: has {there[0]} and no {page.name}, so no diagnosis wrote it; expected another folder"
+        )
 
 
 def pages_of_demo(folder: Path) -> list[Path]:
@@ -163,6 +177,8 @@ def _check_file(path: Path, option: str, ending: str, *, is_asked: bool = False)
     """Refuse a file that cannot be written, or that is probably not meant; the folder of a page is to be there."""
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
+    if path.is_symlink() and not resolved(path).parent.is_dir():
+        raise UsageError(f"{option} {path}: is a link into a folder that is not there, expected the name of a file")
     streams = ending == _TABLE and is_stream(path)
     if path.exists() and not (path.is_file() or streams):
         raise UsageError(f"{option} {path}: is not a regular file, expected the name of a file")

@@ -38,7 +38,7 @@ _OTHER_FILES = (
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
 #: Largest table: bytes of its file, rows, and cells; each cell takes some hundred bytes while it is read.
-TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 10_000_000, 50_000_000
+TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 6_000_000, 20_000_000
 #: Longest that the largest MAT file takes to read on a loaded computer, s.
 _MAT_S = 300.0
 #: First line by which Excel names the separator.

@@ -524,7 +524,7 @@ class Container:
         """Return where the file ends, without zeros in the place of what a power cut has lost.
 
         They begin anywhere, also within a record, which is then as torn as one whose bytes are missing. More of them
-        than are written at once are judged where they are read.
+        than are written at once are judged where they are read. Behind the end of a file nothing was to be written.
         """
         self._file.seek(max(0, size - _LEAST_ZEROS))
         if size < _LEAST_ZEROS or self._file.read(_LEAST_ZEROS).strip(b"\0"):
@@ -532,7 +532,9 @@ class Container:
         self._file.seek(max(0, size - _WINDOW))
         last = self._file.read(_WINDOW)
         kept = last.rstrip(b"\0")
-        return size - len(last) + len(kept) if kept else size
+        written = size - len(last) + len(kept)
+        has_its_end = kept.endswith(MAGIC) and written > len(MAGIC)
+        return written if kept and not has_its_end else size
 
     def _count(self, size: int) -> None:
         """Count bytes that are read; beyond the limit the file is damaged, whatever it holds."""

@@ -49,6 +49,7 @@ def rechained(
     finished: bool = False,
     cut: int = 0,
     parts: Mapping[str, Attachment] | None = None,
+    machine: str = "",
 ) -> None:
     """Write a recording again as the recorder writes a live one, with a chain that fits.
 
@@ -66,8 +67,12 @@ def rechained(
         Bytes to remove from its end, so that it is torn.
     parts : mapping of str to Attachment, optional
         Attachments in the place of its own.
+    machine : str
+        Another machine, whose file it is made.
     """
     lines, contents = lines_of(path)
+    if machine:
+        contents.run.update(machine=machine, file=path.name)
     contents.attachments.update(parts or {})
     made = _grouped(edit(lines), contents, before)
     path.unlink()

@@ -103,6 +103,19 @@ def test_the_command_gives_3_and_audits_the_others(
     assert main(["replay", *map(str, paths), str(table)]) == 2
 
 
+@pytest.mark.parametrize("count", [1, 63, 64, 5000, 200_000])
+def test_zeros_behind_the_end_of_a_file_are_found(
+    tmp_path: Path, made: list[tuple[str, bytes]], unfinished: bytes, count: int
+) -> None:
+    """A power cut leaves them where something was to be written: in a file without its end."""
+    found = audit(placed(tmp_path, made, 1, made[1][1] + bytes(count)))
+    assert [(finding.kind, finding.file) for finding in found.findings] == [("damaged", made[1][0])], summary(found)
+    assert f"{count} bytes after the end of the file" in found.findings[0].line() and found.samples == 18
+    live = tmp_path / f"{MACHINE}_20260105T061800Z.mcap"
+    live.write_bytes(unfinished + bytes(count))
+    assert audit([live]).clean
+
+
 @pytest.fixture(scope="module")
 def unfinished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The newest file of a service that runs on."""

@@ -256,3 +256,85 @@ def test_what_is_no_key_is_said(tmp_path: Path) -> None:
     wrong.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
     with pytest.raises(UsageError, match="expected an Ed25519 public key"):
         Verifier(wrong)
+
+
+# ------------------------------------------------------------------ the end that no seal covers yet
+
+
+def _behind(path: Path, more: Callable[[list[Line]], list[list[Line]]]) -> None:
+    """Write groups of forged records behind the last one, with a chain that fits."""
+
+    def longer(lines: list[Line]) -> list[Line]:
+        made = list(lines)
+        for group in more(lines):
+            made += [*group, replace(lines[-1], time_ns=group[0].time_ns)]  # the chain is made anew
+        return made
+
+    rechained(path, longer)
+
+
+def _dated(line: Line, time_ns: int) -> Line:
+    """Return a record as if it were of another time."""
+    old = f'"time_utc_ns":{line.time_ns},'.encode()
+    assert old in line.data
+    return replace(line, time_ns=time_ns, data=line.data.replace(old, f'"time_utc_ns":{time_ns},'.encode()))
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> tuple[Path, Path, int]:
+    """A recording of a service that runs, half an hour after its last seal, the public key, and its last time."""
+    private, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec", signer=Signer(private)).run(90).kill()
+    path = path_in(tmp_path / "rec")
+    assert audit([path], public_key=public).clean
+    return path, public, lines_of(path)[0][-1].time_ns
+
+
+def _unsigned(path: Path, public: Path) -> bool:
+    return "unsigned" in {finding.kind for finding in audit([path], public_key=public).findings}
+
+
+@pytest.mark.parametrize("apart_ns", [0, 1, MINUTE_NS])
+def test_offsets_without_samples_are_not_young_for_ever(running: tuple[Path, Path, int], apart_ns: int) -> None:
+    path, public, last_ns = running
+
+    def held(lines: list[Line]) -> list[list[Line]]:
+        offset = lines[find(lines, "offset", -1)]
+        return [[_dated(offset, last_ns + (i + 1) * apart_ns)] for i in range(100)]
+
+    _behind(path, held)
+    assert _unsigned(path, public)
+
+
+@pytest.mark.parametrize("topic", ["offset", "sample", "event"])
+def test_what_is_dated_days_ahead_is_not_young(running: tuple[Path, Path, int], topic: str) -> None:
+    """All of one time, in several groups: the recorder writes the seal behind the first."""
+    path, public, last_ns = running
+
+    def ahead(lines: list[Line]) -> list[list[Line]]:
+        day = _dated(lines[find(lines, topic, -1)], last_ns + 30 * 1440 * MINUTE_NS)
+        return [[replace(day, time_ns=last_ns)], [replace(day, time_ns=last_ns)]]
+
+    _behind(path, ahead)
+    assert _unsigned(path, public)
+
+
+def test_a_probe_that_is_reported_late_does_not_make_a_file_old(running: tuple[Path, Path, int]) -> None:
+    path, public, last_ns = running
+
+    def late(lines: list[Line]) -> list[list[Line]]:
+        event = _dated(lines[find(lines, "event", -1)], last_ns - 600 * MINUTE_NS)
+        return [[replace(event, time_ns=last_ns)], [replace(event, time_ns=last_ns)]]
+
+    _behind(path, late)
+    assert not _unsigned(path, public)
+
+
+@pytest.mark.parametrize("name", ["vmc-99_20260106T000000Z.mcap", "other.mcap"])
+def test_a_file_of_another_machine_is_not_the_one_that_is_being_written(signed: tuple[Path, Path], name: str) -> None:
+    folder, public = signed
+    forged = folder / name
+    forged.write_bytes(path_in(folder).read_bytes())
+    rechained(forged, lambda lines: without_seals(lines)[:150], before=b"\0" * 32, machine="vmc-99")
+    assert [finding.kind for finding in audit([path_in(folder), forged], public_key=public).findings] == ["unsigned"]
+    assert audit([path_in(folder)], public_key=public).clean

@@ -164,6 +164,20 @@ def test_a_page_says_near_its_beginning_that_it_is_one(tmp_path: Path, ending: s
     check_replaced(write(tmp_path / f"page{ending}", Page(title="Größe " * 30, verdict="good")), option="--page")
 
 
+@pytest.mark.parametrize("name", ["model.toml", "diagnosis.json", "series.csv", "series-z.csv"])
+def test_a_diagnosis_replaces_what_a_diagnosis_wrote(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    """A folder of calibrations may have a `model.toml`, which nobody named."""
+    (folder / "d").mkdir()
+    (folder / "d" / name).write_text("mine")
+    call = ["diagnose", "run.csv", "--model", "quill", "--out", "d"]
+    refused(capsys, call, f"--out d: has {name} and no report.html, so no diagnosis wrote it")
+    write(folder / "d" / "report.html", Page(title="day", verdict="good"))
+    assert main(call) == 2
+    assert "no diagnosis wrote it" not in capsys.readouterr().err  # it goes on to read run.csv
+
+
 def bind(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as made:
         made.bind(path.name)
@@ -220,6 +234,15 @@ def test_what_is_no_file_is_refused_before_the_work(
         short.chdir((folder / out).parent)
         SPECIAL[what](folder / out)
     refused(capsys, call.split(), f"{out}: ", "not a regular file, expected the name of a file")
+
+
+@pytest.mark.parametrize(("call", "out"), WRITING)
+def test_a_link_into_nowhere_is_refused_before_the_work(
+    folder: Path, capsys: pytest.CaptureFixture[str], call: str, out: str
+) -> None:
+    (folder / out).parent.mkdir(exist_ok=True)
+    (folder / out).symlink_to("nowhere/file")
+    refused(capsys, call.split(), f"{out}: ", "a link into a folder that is not there")
 
 
 @pytest.mark.parametrize("out", [".", "/", ".."])
