@@ -1,5 +1,7 @@
 """A fluid that flows now and then is found by its flow and its temperature, and predicts another day."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,34 @@ def test_a_fluid_whose_temperature_does_not_move_is_one():
     assert term.effect.channels == ("coolant_lpm", "coolant_degc")
     # With the noise of 0.3 µm 0.35 is left.
     assert np.hypot(found.rest_um, 0.3) < 0.35
+
+
+#: Of a surface under a fan: its time constant without it, min, and by which factor the fan outdoes what is behind it.
+SURFACE_MIN, TIMES = 120.0, 4.0
+
+
+def fanned(signals):
+    """A surface of the quill, as warm as the quill until a fan cools it; the less is left to cool the longer."""
+    fan, warm, below = np.abs(signals[1]["fan_rpm"]) / 3000.0, signals[4], 0.0
+    found = []
+    for i in range(signals[0]):
+        for _ in range(10):
+            below += (TIMES * fan[i] * (warm[i] - below) - below) / SURFACE_MIN / 10.0
+        found.append(-0.4 * below)
+    return np.array(found)
+
+
+def test_a_fan_that_comes_and_goes_cools_a_surface_that_follows():
+    """While it blows the surface follows in 24 min, and when it stops in 120: no filter of fixed lags does both."""
+    model = dataclasses.replace(QUILL, held_out_rms_um=0.3)  # forms are approximate, as on a real machine
+    scenario = [Scenario(place=("scheduled", "DTF", "fan_rpm"), act=fanned)]
+    columns, _, _ = record(scenario, 1410, 36.0)
+    found = diagnose(model, runs_from(columns))
+    assert found.effects[0].place == ("scheduled", "DTF", "fan_rpm") and found.effects[0].form == "film"
+    columns, true, _ = record(scenario, 1411, 36.0)
+    (run,) = runs_from(columns)
+    errors = [np.std(true - predict(one, run)) for one in (model, found.model)]
+    assert errors[0] > 2.0 and errors[1] < 0.1 * errors[0]
 
 
 @pytest.mark.parametrize(("channel", "name"), [("a_rpm", "_rpm"), ("a_l_per_min", "_l_per_min"), ("coolant_flow", "")])

@@ -196,6 +196,63 @@ class FilterBank(Block):
         return np.column_stack([lag.filter(u) for u, row in zip(inputs, self._rows, strict=True) for _, lag in row])
 
 
+class Exchange(Block):
+    """Heat that a film exchanges with a surface, which follows in temperature and leaves the less to exchange.
+
+    With c the film's conductance as a share of its largest and d the difference that drives it, had the surface not
+    followed:  q = (1 + κ) c d − κ c δ,  δ = L(τ) q,  so that q is d in the end where c is 1.
+
+    Parameters
+    ----------
+    half : float
+        Conductance of what is behind the surface, 1/κ: at c = half the film carries half of what a large one would.
+    surface_min : float
+        Time constant τ of the surface without a film, min; 0 if it follows at once.
+    period_min : float
+        Sample period, min.
+
+    Examples
+    --------
+    >>> Exchange(1.0, 10.0, 1.0).filter(np.array([0.0, 1.0, 1.0, 0.5]), np.ones(4)).round(3)
+    array([0.   , 1.909, 1.744, 0.823])
+    """
+
+    def __init__(self, half: float, surface_min: float, period_min: float) -> None:
+        lag = lag_or_none(surface_min, period_min)
+        self._kappa, self._follows_at_once = 1.0 / half, surface_min == 0.0
+        self._pole, self._half = lag.pole, (1.0 - lag.pole) / 2.0
+        self.state = (NAN, 0.0)
+
+    def step(self, *inputs: float) -> float:
+        """Advance by one sample of conductance and difference."""
+        (conductance, difference), (surface, before) = inputs, self.state
+        given, taken = (1.0 + self._kappa) * conductance * difference, self._kappa * conductance
+        if self._follows_at_once or math.isnan(surface):
+            surface = given / (1.0 + taken)
+        else:
+            surface = (self._pole * surface + self._half * (given + before)) / (1.0 + self._half * taken)
+        heat = given - taken * surface
+        self.state = (surface, heat)
+        return heat
+
+    def filter(self, *inputs: Vector) -> Vector:
+        """Return the heat over a record of conductance and difference that begins in balance."""
+        from scipy.linalg import solve_banded  # here, because the service never needs it
+
+        conductance, difference = inputs
+        given, taken = (1.0 + self._kappa) * conductance * difference, self._kappa * conductance
+        if self._follows_at_once:
+            return np.asarray(given / (1.0 + taken))
+        # Each sample by the one before it, with the heat of that one written out.
+        bands, right = np.zeros((3, given.size)), np.empty_like(given)
+        bands[1] = 1.0 + self._half * taken
+        bands[2, :-1] = self._half * taken[:-1] - self._pole
+        right[1:] = self._half * (given[1:] + given[:-1])
+        bands[1, 0], right[0] = 1.0 + taken[0], given[0]
+        # With a band above, which is empty, it is called tridiagonal, and ten times as fast.
+        return np.asarray(given - taken * solve_banded((1, 1), bands, right, check_finite=False))
+
+
 class Limit(Block):
     """A value that goes no further than a limit to either side; the state is by how much it would have.
 

@@ -1,10 +1,11 @@
 """`input`, form `flow`: a fluid that flows now and then heats or cools what it wets.
 
-y += Σ_i L(τ_i) · [gain_i · s · (F − T_Q) + gain_air_i · s · (F − AT)], less that at the start
+y += Σ_i L(τ_i) · [gain_i · X(φ, F − T_Q) + gain_air_i · X(φ, F − AT)], less that at the start
 
-with F the temperature of the fluid and s how much of it acts: with φ the flow as a share of its span,
-s = φ (1 + h) / (φ + h). What is wetted lies between T_Q and AT in temperature, so both differences act. The more flows,
-the better a film conducts, until what is behind it limits the heat: at φ = h half of what a large flow would carry.
+with F the temperature of the fluid, φ the flow as a share of its span, and X what the film exchanges (`Exchange`). What
+is wetted lies between T_Q and AT in temperature, so both differences act. The more flows, the better a film conducts,
+until what is behind it limits the heat: at φ = h half of what a large flow would carry, once what is wetted has
+followed.
 """
 
 from __future__ import annotations
@@ -13,8 +14,18 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import Block, FilterBank, FromStart, S
+from compensator.model.effects.base import (
+    BankEffect,
+    Effect,
+    Run,
+    number,
+    numbers,
+    only,
+    optional_number,
+    register,
+    text,
+)
+from compensator.model.effects.blocks import Block, Exchange, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
 from compensator.model.effects.seen import Seen, digits, quantity, unit_in, unit_of_channel
@@ -36,23 +47,28 @@ class Flow(BankEffect, Effect):
     fluid: str = text()
     span: float = number(1e-12)
     half: float = number(1e-6, 1e6)
+    surface_min: float = optional_number(0.0, 1e5, default=0.0)
     tau_min: tuple[float, ...] = numbers(0.0, 1e5)
     gain: tuple[float, ...] = numbers()
     gain_air: tuple[float, ...] = numbers()
 
     def blocks(self, period_min: float) -> tuple[Block, ...]:
-        return FromStart(), FromStart(), FilterBank(self.tau_min, (self.gain, self.gain_air), period_min)
+        films = (Exchange(self.half, self.surface_min, period_min) for _ in range(2))
+        return *films, FromStart(), FromStart(), FilterBank(self.tau_min, (self.gain, self.gain_air), period_min)
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         flow = signals.channels[self.channel] / self.span
         flow = 0.5 * (flow + abs(flow))  # noise about 0 is no flow
-        acting = flow * (1.0 + self.half) / (flow + self.half)
         fluid = signals.channels[self.fluid]
-        return run[0](acting * (fluid - signals.t_q_degc)), run[1](acting * (fluid - signals.at_degc))
+        return run[2](run[0](flow, fluid - signals.t_q_degc)), run[3](run[1](flow, fluid - signals.at_degc))
 
     @property
     def channels(self) -> tuple[str, ...]:
         return self.channel, self.fluid
+
+    @property
+    def time_constants_min(self) -> tuple[float, ...]:
+        return *self.tau_min, self.surface_min
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest by the fluid's temperature at the largest flow, the time to half of it, and h."""
@@ -66,8 +82,18 @@ class Flow(BankEffect, Effect):
         return tuple(a + b for a, b in zip(self.gain, self.gain_air, strict=True))
 
     def half_time_min(self) -> float:
-        """Return the time to half of a step's response at rest, min."""
-        return half_time_min(self.tau_min, self._gains)
+        """Return the time to half of the response at rest to the largest flow, min."""
+        kappa = 1.0 / self.half
+        # What is wetted follows with this time constant under the largest flow. Cascaded lags are a sum of lags.
+        follows = self.surface_min / (1.0 + kappa) * (1.0 + 1e-9)
+        if not follows:
+            return half_time_min(self.tau_min, self._gains)
+        apart = [kappa / (tau - follows) for tau in self.tau_min]
+        own = [
+            gain * (1.0 + kappa - tau * part) for tau, gain, part in zip(self.tau_min, self._gains, apart, strict=True)
+        ]
+        shared = follows * math.fsum(gain * part for gain, part in zip(self._gains, apart, strict=True))
+        return half_time_min((*self.tau_min, follows), (*own, shared))
 
     def explain(self, seen: Seen) -> str:
         assert seen.channel is not None
@@ -92,8 +118,11 @@ def flows(context: Context) -> Iterator[Hypothesis]:
     half = Free(name="half", low=0.01, high=100.0, grid=(0.03, 0.3, 3.0))
     one, several = context.tau(), context.bank_min
     for channel in sorted(context.zeroed):
+        is_flow = unit_in(channel) in FLOWS
+        # What resembles a flow only by its zero has enough in common with any temperature without it.
+        searched = (half, context.surface()) if is_flow else (half,)
         for fluid in context.temperatures:
-            if fluid not in context.spans and unit_in(channel) not in FLOWS:
+            if fluid not in context.spans and not is_flow:
                 continue
             place: dict[str, Any] = {"channel": channel, "fluid": fluid, "span": context.spans[channel], "half": 1.0}
             form = f"flow of {fluid}"
@@ -101,7 +130,7 @@ def flows(context: Context) -> Iterator[Hypothesis]:
                 ones = (1.0,) * len(several)
                 bank = FlowBank(**place, tau_min=several, gain=ones, gain_air=ones)
                 names = (*numbered("gain", len(several)), *numbered("gain_air", len(several)))
-                yield Hypothesis(effect=bank, form=f"row, {form}", free=(half,), amplitudes=names)
+                yield Hypothesis(effect=bank, form=f"row, {form}", free=searched, amplitudes=names)
             else:
                 lag = Flow(**place, tau_min=(0.0,), gain=(1.0,), gain_air=(1.0,))
                 gains = ("gain_um_per_k", "gain_air_um_per_k")

@@ -220,6 +220,11 @@ class Context:
         longest = min(BANK_LONGEST_MIN, max(self.minutes / 3.0, 20.0 * self.period_min))
         return tuple(float(t) for t in np.geomspace(self.period_min, longest, BANK))
 
+    def surface(self) -> Free:
+        """Return the time constant of a surface that follows what it exchanges heat with, as `tau`, coarser."""
+        tau = self.tau("surface_min")
+        return dataclasses.replace(tau, grid=tau.grid[2::3], key="")
+
     def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
         """Return a time constant, from a sample to a third of the record."""
         high = max(self.minutes / 3.0, 10.0 * self.period_min)

@@ -4,9 +4,10 @@ share    y += change · c · y_path
 drive    y += change · G · (c · drive)
 speed    y += change · c · (L(τ) − 1) · y_path
 row      y += Σ_i L(τ_i) · (gain_i · c · drive + gain_share_i · c · y_path)
+film     y += Σ_i L(τ_i) · (gain_i · X(|c|, drive) + gain_share_i · X(|c|, y_path))
 
-with c the channel in units of its own span: as it is where it has a zero of its own (a speed, a flow), as its
-change from the start where it has none (a temperature).
+with X what a film exchanges whose surface follows (`Exchange`), and c the channel in units of its own span: as it is
+where it has a zero of its own (a speed, a flow), as its change from the start where it has none (a temperature).
 """
 
 from __future__ import annotations
@@ -21,11 +22,15 @@ import numpy as np
 
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
-from compensator.model.effects.hypothesis import Context, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import Seen, digits, quantity
+from compensator.model.effects.blocks import Block, Exchange, FilterBank, FromStart, Function, Lag, S
+from compensator.model.effects.flow import FLOWS
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.seen import Seen, digits, quantity, unit_in
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
+
+#: Units of what moves the medium of a film: a speed, or a flow. A power or a load may stand for the heat itself.
+MOVES = ("rpm", "1_per_min", *FLOWS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +57,14 @@ class Scheduled(Effect):
         """Return the channel in units of its span."""
         return run[0](signals.channels[self.channel]) / self.span
 
+    def acting(self, value: float) -> float:
+        """Return which part of the change a value of the channel makes in the end."""
+        return value / self.span
+
     def explain(self, seen: Seen) -> str:
         assert seen.channel is not None
         low, high = seen.channel.ends(self.channel)
-        change = self.named({"change": getattr(self, "change", 0.0)})["change"] * (high - low) / self.span
+        change = self.named({"change": getattr(self, "change", 0.0)})["change"] * (self.acting(high) - self.acting(low))
         return (
             f"{seen.words}: the {self.what} of the {self.path}{seen.path_words} changes by {digits(100.0 * change)} % "
             f"from {digits(low)} to {quantity(high, self.channel)} of {self.channel}. The channel "
@@ -137,6 +146,35 @@ class BankScheduled(BankEffect, Scheduled):
         return {"change": math.fsum(self.gain) / self.dc_gain + math.fsum(self.gain_share)}
 
 
+@register
+class FilmScheduled(BankScheduled):
+    """The same of a film whose surface follows in temperature: the more it carries, the less is left to carry."""
+
+    form: str = only(default="film")
+    half: float = number(1e-6, 1e6)
+    surface_min: float = number(0.0, 1e5)
+
+    def named(self, given: dict[str, float]) -> dict[str, float]:
+        """Return the change as `BankScheduled` does, and the time constant of the surface without the film."""
+        return BankScheduled.named(self, given) | {"surface_min": self.surface_min}
+
+    def acting(self, value: float) -> float:
+        c = abs(value) / self.span
+        return c * (1.0 + self.half) / (c + self.half)
+
+    def inner(self, period_min: float) -> tuple[Block, ...]:
+        films = (Exchange(self.half, self.surface_min, period_min) for _ in range(2))
+        return *films, *BankScheduled.inner(self, period_min)
+
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
+        c = abs(self.scale(signals, run))
+        return run[1](c, signals.source_from_rest(self.path)), run[2](c, signals.share_from_rest(self.path))
+
+    @property
+    def time_constants_min(self) -> tuple[float, ...]:
+        return *self.tau_min, self.surface_min
+
+
 @proposes
 def schedules(context: Context) -> Iterator[Hypothesis]:
     """Propose every form for every channel that moves and every path."""
@@ -152,6 +190,12 @@ def schedules(context: Context) -> Iterator[Hypothesis]:
             both = tuple(np.repeat([context.gain_change(path), *sizes], len(taus)).tolist())
             bank = BankScheduled(**place, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain)
             yield Hypothesis(effect=bank, form="row", amplitudes=gains, sizes=both)
+            if origin == "zero" and unit_in(channel) in MOVES:
+                film = FilmScheduled(
+                    **place, half=1.0, surface_min=0.0, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain
+                )
+                free = (Free(name="half", low=0.01, high=100.0, grid=(0.1, 1.0)), context.surface())
+                yield Hypothesis(effect=film, form="film", free=free, amplitudes=gains, sizes=both)
         yield Hypothesis(effect=ShareScheduled(**place, change=1.0), form="share", amplitudes=change, sizes=sizes)
         yield Hypothesis(
             effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change, sizes=sizes
