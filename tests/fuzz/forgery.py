@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import shutil
 import struct
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 from compensator.audit.series import Audit, audit
@@ -24,13 +26,15 @@ from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, HEADER, M
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 from tests.audit.attacks import rechained, unsigned_seals, without_seals
-from tests.audit.made import MACHINE, Service
+from tests.audit.made import MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.audit.test_signatures import write_key
 from tests.fuzz.mutation import mutated
 
 #: Minutes that the recorded service ran each time; it was stopped, and then killed, once right after an hourly seal.
 RUNS = (65, 20, 61, 70)
+HOUR_MIN = 60
+TIME = re.compile(rb'"time_utc_ns":(\d+),')
 #: Attacks after which no other can read a file, in this order.
 _LAST = ("begun", "emptied", "large")
 _NONE_LEFT = "no file with a record is left"
@@ -119,7 +123,30 @@ def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
         count = originals.written(name) if head else originals.signed(name, found)
         if found[:count] != originals.records[name][:count]:
             return f"{name}: one of the first {count} records"
+    for name in kept[:-1]:
+        if there[name].stat().st_size and not there[name].read_bytes().endswith(MAGIC):
+            return f"{name}: bytes behind its end"
+    if older := _older(there[kept[-1]]):
+        return f"{kept[-1]}: {older}"
     return next((f"{path.name}: {twice} in two places" for path in there.values() if (twice := _twice(path))), "")
+
+
+def _older(path: Path) -> str:
+    """Return by what the end of the newest file that no signature covers is older than an hour; empty if it is not."""
+    lines: list[Line] = []
+    with suppress(DataError):
+        lines = lines_of(path)[0]
+    seals = [i for i, line in enumerate(lines) if line.topic == "seal" and b'"signature":""' not in line.data]
+    start = max(seals, default=0)
+    behind = lines[start:]
+    for topic in ("sample", "offset"):
+        if (count := sum(line.topic == topic for line in behind)) > 2 * HOUR_MIN:
+            return f"{count} of {topic} behind its last signature"
+    ends, late = [i for i, line in enumerate(behind) if line.topic == "chain"], 0
+    for i, end in pairwise([0, *ends]):
+        own = [TIME.search(line.data) for line in behind[i:end] if line.topic != "chain"]
+        late += any(one is not None and int(one[1]) - lines[start].time_ns >= HOUR_MIN * 60e9 for one in own)
+    return f"{late} groups of an hour and more after its last signature" if late > 1 else ""
 
 
 def _twice(path: Path) -> str:
@@ -296,6 +323,33 @@ def _added(rng: random.Random, paths: list[Path]) -> None:
     path.write_bytes(data[:where] + extra * rng.choice((1, 1, 50)) + data[where:])
 
 
+def _lengthened(rng: random.Random, paths: list[Path]) -> None:
+    """Put records behind the end that nobody has signed: of one kind or all, dated as the forger likes."""
+    of = rng.choice((("offset",), ("event",), ("sample", "estimate", "offset")))
+    count = rng.choice((1, 3, 20, 70, 130, 300))
+    apart_ns, ahead_ns, logged = rng.choice((0, 1, MINUTE_NS)), rng.choice((0, 50, 43_200)) * MINUTE_NS, rng.random()
+
+    def longer(lines: list[Line]) -> list[Line]:
+        copied = [next(line for line in reversed(lines) if line.topic == topic) for topic in of]
+        made, last_ns = list(lines), lines[-1].time_ns
+        for i in range(count):
+            own_ns = last_ns + ahead_ns + (i + 1) * apart_ns
+            time_ns = own_ns if logged < 0.5 else last_ns
+            for line in copied:
+                dated = TIME.sub(b'"time_utc_ns":%d,' % own_ns, line.data, count=1)
+                made.append(replace(line, time_ns=time_ns, data=dated))
+            made.append(replace(lines[-1], time_ns=time_ns))
+        return made
+
+    rechained(paths[-1], longer)
+
+
+def _zeros(rng: random.Random, paths: list[Path]) -> None:
+    """Put zeros behind a file."""
+    with rng.choice(paths).open("ab") as file:
+        file.write(bytes(rng.choice((1, 63, 64, 5000, 200_000))))
+
+
 def _large(rng: random.Random, paths: list[Path]) -> None:
     """A file of zeros, or zeros behind a recording, which take no space on the disk."""
     size = rng.choice((LARGEST + 1, 4 * 10**9, 10**11))
@@ -328,6 +382,9 @@ ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
     "emptied": _emptied,
     "seal": _seal,
     "added": _added,
+    "lengthened": _lengthened,
+    "lengthened again": _lengthened,
+    "zeros": _zeros,
     "large": _large,
     "begun": _begun,
 }
