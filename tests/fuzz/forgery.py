@@ -123,9 +123,10 @@ def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
         count = originals.written(name) if head else originals.signed(name, found)
         if found[:count] != originals.records[name][:count]:
             return f"{name}: one of the first {count} records"
-    for name in kept[:-1]:
-        if there[name].stat().st_size and not there[name].read_bytes().endswith(MAGIC):
-            return f"{name}: bytes behind its end"
+    for name in kept:
+        data = there[name].read_bytes()
+        if data.endswith(b"\0") and data.rstrip(b"\0").endswith(MAGIC):
+            return f"{name}: zeros behind its end"
     if older := _older(there[kept[-1]]):
         return f"{kept[-1]}: {older}"
     return next((f"{path.name}: {twice} in two places" for path in there.values() if (twice := _twice(path))), "")
