@@ -108,8 +108,8 @@ def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
     for name, path in there.items():
         if path.stat().st_size > LARGEST:
             return f"{name}: {path.stat().st_size} bytes, which no service writes"
-    kept = [name for name in originals.names if name in there]
-    if not any(there[name].stat().st_size for name in kept):
+    kept = [name for name in originals.names if name in there and there[name].stat().st_size]
+    if not kept:
         return _NONE_LEFT if head else ""
     first, last = originals.names.index(kept[0]), originals.names.index(kept[-1])
     if kept != originals.names[first : last + 1]:
