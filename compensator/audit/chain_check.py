@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from dataclasses import replace
 
 import msgspec
@@ -26,6 +27,8 @@ from compensator.recording.signature import Verifier
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
 _TIME = re.compile(rb'"time_utc_ns":(\d{1,19}),')
+#: What is computed in a sample: at most one of each in its group, with the time of the sample.
+_OF_SAMPLES = frozenset(("sample", "estimate", "candidate", "offset", "offsets"))
 #: A message of the chain: or its hashes are no hexadecimal numbers.
 _UNREADABLE = (*UNREADABLE, ValueError)
 
@@ -68,6 +71,8 @@ class ChainCheck:
         #: Time of the last valid signature or of the start of the file; whether the next group must be a seal, and
         #: whether this one must.
         self._signed_ns, self._due, self._is_late = 0, False, False
+        #: Records since then, by topic.
+        self._behind = Counter[str]()
         #: Times of the last record that a signature or the head covers, and of the last record.
         self._covered_ns = self._last_ns = 0
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
@@ -131,8 +136,9 @@ class ChainCheck:
     def add_rest(self, records: list[RawRecord]) -> None:
         """Count the records after the last `/chain` message: the file ends within a group."""
         result = self._result
-        self._is_late = self._due
-        for record in records:
+        for i, record in enumerate(records):
+            # A seal that is due begins its group; whether it is signed was not looked at.
+            self._is_late = self._due and not (i == 0 and record.topic == "seal")
             self.head = chain.link(self.head, record.topic, record.body)
             result.seal, result.sealed_signed = "", False
             self._add_unsigned(record.topic, record.log_time_ns, record.body)
@@ -344,31 +350,36 @@ class ChainCheck:
             result.find(Fault.FALSE_SIGNATURE, record)
             self._add_unsigned(record.topic, record.log_time_ns, record.body)
         elif (seal.sha256, seal.sequence) == (before.hex(), record.sequence - 1):
+            result.proven = True
             self._covered(seal.time_utc_ns)
 
     def _add_unsigned(self, topic: str, time_ns: int, body: bytes) -> None:
         """Count a record that no signature covers yet.
 
-        It counts by its own time, too: without a signature either can be rewritten. That of a sample is that of its
-        group; what is reported late, such as a probe, may have been measured long before.
+        What is computed in a sample has the time of its group: without a signature either can be rewritten, so both
+        count. A probe or an event states a time that others may have set, and counts by that of its group.
         """
         result = self._result
         result.unsigned_behind += 1
         result.unsigned_samples += topic == "sample"
-        result.unsigned_offsets += topic == "offset"
-        own = _TIME.search(body)
-        if own is not None and (topic == "sample" or int(own[1]) > self._signed_ns):
-            time_ns = max(time_ns, int(own[1]), key=lambda ns: abs(ns - self._signed_ns))
+        if topic in _OF_SAMPLES:
+            self._behind[topic] += 1
+            result.unsigned_offsets = max(self._behind.values())
+            own = _TIME.search(body)
+            if own is not None and int(own[1]) != time_ns:
+                result.overdue = True
+                time_ns = max(time_ns, int(own[1]), key=lambda ns: abs(ns - self._signed_ns))
         age_ns, self._last_ns = abs(time_ns - self._signed_ns), time_ns
         result.unsigned_min = max(result.unsigned_min, abs(time_ns - self._covered_ns) / 60e9)
-        # After the group with which a seal is due the recorder writes nothing before that seal.
-        result.overdue = result.overdue or (self._is_late and topic != "seal")
+        # After the group with which a seal is due the recorder writes nothing before that seal, which it signs.
+        result.overdue = result.overdue or self._is_late
         self._due = self._due or age_ns >= chain.SEAL_EVERY_NS
 
     def _covered(self, time_ns: int) -> None:
         """Note that everything up to here is signed."""
         result = self._result
         result.unsigned_behind = result.unsigned_samples = result.unsigned_offsets = 0
+        self._behind.clear()
         result.unsigned_min, result.overdue = 0.0, False
         self._signed_ns = self._covered_ns = time_ns
         self._due = self._is_late = False

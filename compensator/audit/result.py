@@ -35,11 +35,15 @@ class RecordingAudit:
     records : int
         Records in the chain.
     signed, unsigned_behind, unsigned_samples, unsigned_offsets : int
-        Signed seals, and records, samples and offsets after the last of them that is valid.
+        Signed seals; after the last of them that is valid records, samples, and those of the kind that is computed in a
+        sample of which there are most.
+    proven : bool
+        Whether a seal is valid.
     unsigned_min : float
-        Time from that seal, or from the start of the file, to the record that is furthest from it, min.
+        Time from what a valid seal or the head covers, or from the start of the file, to the record that is furthest
+        from it, min.
     overdue : bool
-        Whether a seal was due in that time: the recorder would not have gone on without it.
+        Whether a seal was due in that time, or a time is not that of its group: no recorder goes on so.
     at_head : bool
         Whether its chain contains a value that the machine's head states.
     outside : list of str
@@ -85,6 +89,7 @@ class RecordingAudit:
     findings_count: int = 0
     records: int = 0
     signed: int = 0
+    proven: bool = False
     unsigned_behind: int = 0
     unsigned_samples: int = 0
     unsigned_offsets: int = 0

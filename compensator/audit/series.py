@@ -294,7 +294,7 @@ class _Series:
         self._newest = {file.machine: file.file for file in begun}
         #: Only the file that was started last may still be without its next seal; a head states which one that is.
         #: It is of a machine of which something is signed, if anything is: the key is that of one machine.
-        of = {file.machine for file in begun if file.signed}
+        of = {file.machine for file in begun if file.proven}
         own = [file for file in begun if file.machine in of] or begun
         self._live = newest or (max(own, key=lambda file: _started(file.original)).file if own else "")
         self._signed = signed

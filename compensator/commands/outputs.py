@@ -10,13 +10,14 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from compensator.atomic_write import is_stream
 from compensator.errors import UsageError
-from compensator.input_file import resolved
+from compensator.input_file import RESULT_BYTES, read_file, resolved
 
 #: Suffixes that are probably mistakes.
 _ENDINGS = {".csv", ".html", ".json", ".mcap", ".pdf", ".png", ".toml", ".xlsx"}
@@ -122,13 +123,16 @@ def files_of_diagnosis(folder: Path) -> list[Path]:
 
 
 def check_diagnosis(folder: Path, option: str) -> None:
-    """Refuse a folder that has files of these names without the page that a diagnosis writes beside them."""
-    there = [path.name for path in files_of_diagnosis(folder) if path.exists()]
-    page = folder / "report.html"
-    if there and page.name not in there:
-        raise UsageError(
-            f"{option} {folder}: has {there[0]} and no {page.name}, so no diagnosis wrote it; expected another folder"
-        )
+    """Refuse a folder that has files of these names, and neither page nor result of a diagnosis."""
+    from compensator.api.diagnosis import FILES
+
+    there = [name for name in FILES if (folder / name).exists()]
+    if not there or "report.html" in there:
+        return
+    with suppress(OSError, UsageError):
+        if b'"verdict"' in read_file(folder / "diagnosis.json", RESULT_BYTES):
+            return
+    raise UsageError(f"{option} {folder}: has {there[0]}, which no diagnosis wrote; expected another folder")
 
 
 def pages_of_demo(folder: Path) -> list[Path]:

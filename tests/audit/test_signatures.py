@@ -300,33 +300,67 @@ def test_offsets_without_samples_are_not_young_for_ever(running: tuple[Path, Pat
 
     def held(lines: list[Line]) -> list[list[Line]]:
         offset = lines[find(lines, "offset", -1)]
-        return [[_dated(offset, last_ns + (i + 1) * apart_ns)] for i in range(100)]
+        return [[_dated(offset, last_ns + (i + 1) * apart_ns)] for i in range(60 if apart_ns == MINUTE_NS else 100)]
 
     _behind(path, held)
     assert _unsigned(path, public)
 
 
-@pytest.mark.parametrize("topic", ["offset", "sample", "event"])
-def test_what_is_dated_days_ahead_is_not_young(running: tuple[Path, Path, int], topic: str) -> None:
-    """All of one time, in several groups: the recorder writes the seal behind the first."""
+@pytest.mark.parametrize("days", [-30, 30])
+@pytest.mark.parametrize("topic", ["offset", "sample", "estimate"])
+def test_what_has_another_time_than_its_group_is_not_young(
+    running: tuple[Path, Path, int], topic: str, days: int
+) -> None:
+    path, public, last_ns = running
+
+    def dated(lines: list[Line]) -> list[list[Line]]:
+        day = _dated(lines[find(lines, topic, -1)], last_ns + days * 1440 * MINUTE_NS)
+        return [[replace(day, time_ns=last_ns)]]
+
+    _behind(path, dated)
+    assert _unsigned(path, public)
+
+
+@pytest.mark.parametrize("topic", ["offset", "event"])
+def test_nothing_follows_the_group_with_which_a_seal_is_due(running: tuple[Path, Path, int], topic: str) -> None:
+    """All of one time: the recorder writes the seal behind the first."""
     path, public, last_ns = running
 
     def ahead(lines: list[Line]) -> list[list[Line]]:
-        day = _dated(lines[find(lines, topic, -1)], last_ns + 30 * 1440 * MINUTE_NS)
-        return [[replace(day, time_ns=last_ns)], [replace(day, time_ns=last_ns)]]
+        return [[_dated(lines[find(lines, topic, -1)], last_ns + 30 * 1440 * MINUTE_NS)]] * 2
 
     _behind(path, ahead)
     assert _unsigned(path, public)
 
 
-def test_a_probe_that_is_reported_late_does_not_make_a_file_old(running: tuple[Path, Path, int]) -> None:
+def test_seals_without_a_signature_do_not_make_a_file_young(running: tuple[Path, Path, int]) -> None:
     path, public, last_ns = running
 
-    def late(lines: list[Line]) -> list[list[Line]]:
-        event = _dated(lines[find(lines, "event", -1)], last_ns - 600 * MINUTE_NS)
+    def sealed(lines: list[Line]) -> list[list[Line]]:
+        seal = msgspec.json.decode(lines[find(lines, "seal", -1)].data, type=Seal)
+        made = []
+        for i in range(3):
+            time_ns = last_ns + (i + 1) * 30 * 1440 * MINUTE_NS
+            data = encode(msgspec.structs.replace(seal, time_utc_ns=time_ns, public_key="", signature=""))
+            made.append([replace(lines[find(lines, "seal", -1)], time_ns=time_ns, data=data)])
+        return made
+
+    _behind(path, sealed)
+    assert _unsigned(path, public)
+
+
+@pytest.mark.parametrize("minutes", [-600, 120])
+def test_the_time_that_a_probe_or_an_event_states_does_not_make_a_file_old(
+    running: tuple[Path, Path, int], minutes: int
+) -> None:
+    """A control in local time is two hours ahead; what is reported late was measured long before."""
+    path, public, last_ns = running
+
+    def stated(lines: list[Line]) -> list[list[Line]]:
+        event = _dated(lines[find(lines, "event", -1)], last_ns + minutes * MINUTE_NS)
         return [[replace(event, time_ns=last_ns)], [replace(event, time_ns=last_ns)]]
 
-    _behind(path, late)
+    _behind(path, stated)
     assert not _unsigned(path, public)
 
 

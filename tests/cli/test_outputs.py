@@ -164,7 +164,7 @@ def test_a_page_says_near_its_beginning_that_it_is_one(tmp_path: Path, ending: s
     check_replaced(write(tmp_path / f"page{ending}", Page(title="Größe " * 30, verdict="good")), option="--page")
 
 
-@pytest.mark.parametrize("name", ["model.toml", "diagnosis.json", "series.csv", "series-z.csv"])
+@pytest.mark.parametrize("name", ["model.toml", "diagnosis.json", "series.csv"])
 def test_a_diagnosis_replaces_what_a_diagnosis_wrote(
     folder: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
@@ -172,10 +172,13 @@ def test_a_diagnosis_replaces_what_a_diagnosis_wrote(
     (folder / "d").mkdir()
     (folder / "d" / name).write_text("mine")
     call = ["diagnose", "run.csv", "--model", "quill", "--out", "d"]
-    refused(capsys, call, f"--out d: has {name} and no report.html, so no diagnosis wrote it")
-    write(folder / "d" / "report.html", Page(title="day", verdict="good"))
-    assert main(call) == 2
-    assert "no diagnosis wrote it" not in capsys.readouterr().err  # it goes on to read run.csv
+    refused(capsys, call, f"--out d: has {name}, which no diagnosis wrote")
+    # What an interrupted one has left, and a page: it goes on to read run.csv.
+    for own, content in (("diagnosis.json", b'{"verdict": "adequate"}'), ("report.html", b"")):
+        (folder / "d" / own).write_bytes(content)
+        assert main(call) == 2 and "no diagnosis wrote" not in capsys.readouterr().err
+        (folder / "d" / own).unlink()
+        (folder / "d" / name).write_text("mine")
 
 
 def bind(path: Path) -> None:

@@ -145,8 +145,10 @@ def _older(path: Path) -> str:
             return f"{count} of {topic} behind its last signature"
     ends, late = [i for i, line in enumerate(behind) if line.topic == "chain"], 0
     for i, end in pairwise([0, *ends]):
-        own = [TIME.search(line.data) for line in behind[i:end] if line.topic != "chain"]
-        late += any(one is not None and int(one[1]) - lines[start].time_ns >= HOUR_MIN * 60e9 for one in own)
+        times = [line.time_ns for line in behind[i:end] if line.topic != "chain"]
+        own = [TIME.search(line.data) for line in behind[i:end] if line.topic in ("sample", "estimate", "offset")]
+        times += [int(one[1]) for one in own if one is not None]
+        late += any(abs(time_ns - lines[start].time_ns) >= HOUR_MIN * 60e9 for time_ns in times)
     return f"{late} groups of an hour and more after its last signature" if late > 1 else ""
 
 
@@ -328,7 +330,11 @@ def _lengthened(rng: random.Random, paths: list[Path]) -> None:
     """Put records behind the end that nobody has signed: of one kind or all, dated as the forger likes."""
     of = rng.choice((("offset",), ("event",), ("sample", "estimate", "offset")))
     count = rng.choice((1, 3, 20, 70, 130, 300))
-    apart_ns, ahead_ns, logged = rng.choice((0, 1, MINUTE_NS)), rng.choice((0, 50, 43_200)) * MINUTE_NS, rng.random()
+    apart_ns, ahead_ns, logged = (
+        rng.choice((0, 1, MINUTE_NS)),
+        rng.choice((0, 50, 43_200, -43_200)) * MINUTE_NS,
+        rng.random(),
+    )
 
     def longer(lines: list[Line]) -> list[Line]:
         copied = [next(line for line in reversed(lines) if line.topic == topic) for topic in of]

@@ -53,6 +53,24 @@ def test_steps_are_what_a_record_gives(surface_min):
     assert stepped == pytest.approx(whole, abs=1e-9)
 
 
+@pytest.mark.parametrize(("half", "surface_min"), [(0.01, 0.6), (0.03, 2.2), (0.001, 30.0), (0.1, 5.0)])
+def test_a_surface_that_follows_within_a_sample_does_not_ring(half, surface_min):
+    """A fan that runs and stops: the heat has one sign, and an odd number of samples ends as an even one does."""
+    ends = []
+    for ran in (20, 21):
+        flow = np.repeat([0.0, 1.0, 0.0, 1.0], [5, ran, 1, 5])
+        heat = Exchange(half, surface_min, 1.0).filter(flow, np.ones(flow.size))
+        assert heat.min() >= 0.0 and np.all(np.diff(heat[5 : 5 + ran]) <= 1e-9)
+        ends.append(heat[6 + ran])
+    assert ends[0] == pytest.approx(ends[1], rel=0.03)
+
+
+def test_a_surface_that_hardly_waits_is_one_that_follows_at_once():
+    flow, difference = pumps(5)
+    soon, at_once = (Exchange(0.2, tau, 1.0).filter(flow, difference) for tau in (1e-6, 0.0))
+    assert soon == pytest.approx(at_once, abs=1e-4)
+
+
 def test_a_surface_that_follows_at_once_saturates():
     flow, difference = pumps(3)
     saturated = difference * flow * 1.25 / (flow + 0.25)
@@ -62,6 +80,14 @@ def test_a_surface_that_follows_at_once_saturates():
 def test_behind_a_good_conductor_the_film_carries_what_it_is_given():
     flow, difference = pumps(4)
     assert Exchange(1e6, 40.0, 1.0).filter(flow, difference) == pytest.approx(flow * difference, abs=1e-4)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-9, -1e-9, 1e-3])
+def test_a_lag_as_long_as_what_is_wetted_follows_is_no_exception(off):
+    table = {"form": "flow", "channel": "a_lpm", "fluid": "a_degc", "span": 8.0, "half": 1.0, "surface_min": 10.0}
+    effect = effect_from("input", table | {"tau_min": [5.0 * (1.0 + off)], "gain": [0.5], "gain_air": [0.2]})
+    # L(5) of 1 + exp(-t/5): 1 − exp(-t/5) + t/5 exp(-t/5) is one half at t = 5 · 0.3149.
+    assert effect.half_time_min() == pytest.approx(5.0 * 0.3149, rel=0.01)
 
 
 @pytest.mark.parametrize("surface_min", [0.0, 12.0, 300.0])

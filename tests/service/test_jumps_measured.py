@@ -40,6 +40,30 @@ def test_measured_y_speaks_for_a_mended_channel_though_it_was_wrong_before_it_ju
     assert outcomes[end + 180].offset.state == "ok"
 
 
+@pytest.mark.parametrize(("begin", "end"), [(300, 360), (400, 450)])
+def test_a_mended_channel_is_used_again_where_y_has_more_noise_than_the_model_errs(
+    day: dict[str, np.ndarray], begin: int, end: int
+) -> None:
+    """The model states 0.06 µm, a value of Y has 0.3: what agrees with Y all the time must not be held for hours."""
+    rng = np.random.default_rng(7)
+    noise = rng.normal(0.0, 0.3, len(day["t_s"]))
+    fault = sticks(begin, end)
+
+    def change(i: int, values: dict[str, float]) -> None:
+        fault(i, values)
+        values["y_um"] += float(noise[i])
+
+    conf = settings({"residual_std_um": 0.06, "false_alarm_days": 30.0, "sensor_must_fit": True})
+    compensation, outcomes = Compensation(conf, QUILL), []
+    for i in range(len(day["t_s"])):
+        values = readings(day, i)
+        change(i, values)
+        outcomes.append(compensation.process(sample(i, values)))
+    assert any("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[begin:])
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    assert not wrong[end + 90 :].any() and not any(o.offset.state == "hold" for o in outcomes[end + 90 :])
+
+
 def followed(day: dict[str, np.ndarray], change: Change, *, restart: int | None = None) -> list[Outcome]:
     """Run with a Y whose deviation hides a small jump; perhaps with a restart."""
     conf = settings({"residual_std_um": 2.3})

@@ -199,8 +199,10 @@ class FilterBank(Block):
 class Exchange(Block):
     """Heat that a film exchanges with a surface, which follows in temperature and leaves the less to exchange.
 
-    With c the film's conductance as a share of its largest and d the difference that drives it, had the surface not
-    followed:  q = (1 + κ) c d − κ c δ,  δ = L(τ) q,  so that q is d in the end where c is 1.
+    With c ≥ 0 the film's conductance as a share of its largest and d the difference that drives it, had the surface not
+    followed:  q = (1 + κ) c d − κ c δ,  δ = L(τ) q,  so that q is d in the end where c is 1. The lag is by Tustin's
+    rule; where a film of 1 settles within about a sample that would ring, and Euler's backward rule is taken. A record
+    has no gaps.
 
     Parameters
     ----------
@@ -218,19 +220,25 @@ class Exchange(Block):
     """
 
     def __init__(self, half: float, surface_min: float, period_min: float) -> None:
-        lag = lag_or_none(surface_min, period_min)
-        self._kappa, self._follows_at_once = 1.0 / half, surface_min == 0.0
-        self._pole, self._half = lag.pole, (1.0 - lag.pole) / 2.0
+        self._kappa = 1.0 / half
+        # surface = keep · surface before + new · heat + old · heat before
+        self._keep, self._new = surface_min / (surface_min + period_min), period_min / (surface_min + period_min)
+        self._old = 0.0
+        lag = Lag(surface_min, period_min)
+        weight = (1.0 - lag.pole) / 2.0
+        if weight * self._kappa < lag.pole:
+            self._keep, self._new, self._old = lag.pole, weight, weight
         self.state = (NAN, 0.0)
 
     def step(self, *inputs: float) -> float:
         """Advance by one sample of conductance and difference."""
         (conductance, difference), (surface, before) = inputs, self.state
         given, taken = (1.0 + self._kappa) * conductance * difference, self._kappa * conductance
-        if self._follows_at_once or math.isnan(surface):
+        if math.isnan(surface):
             surface = given / (1.0 + taken)
         else:
-            surface = (self._pole * surface + self._half * (given + before)) / (1.0 + self._half * taken)
+            known = self._keep * surface + self._old * before
+            surface = (known + self._new * given) / (1.0 + self._new * taken)
         heat = given - taken * surface
         self.state = (surface, heat)
         return heat
@@ -241,16 +249,19 @@ class Exchange(Block):
 
         conductance, difference = inputs
         given, taken = (1.0 + self._kappa) * conductance * difference, self._kappa * conductance
-        if self._follows_at_once:
-            return np.asarray(given / (1.0 + taken))
         # Each sample by the one before it, with the heat of that one written out.
         bands, right = np.zeros((3, given.size)), np.empty_like(given)
-        bands[1] = 1.0 + self._half * taken
-        bands[2, :-1] = self._half * taken[:-1] - self._pole
-        right[1:] = self._half * (given[1:] + given[:-1])
+        bands[1] = 1.0 + self._new * taken
+        bands[2, :-1] = self._old * taken[:-1] - self._keep
+        right[1:] = self._new * given[1:] + self._old * given[:-1]
         bands[1, 0], right[0] = 1.0 + taken[0], given[0]
         # With a band above, which is empty, it is called tridiagonal, and ten times as fast.
         return np.asarray(given - taken * solve_banded((1, 1), bands, right, check_finite=False))
+
+
+def exchanges(half: float, surface_min: float, period_min: float) -> tuple[Exchange, Exchange]:
+    """Return a film's exchange for each of two differences."""
+    return Exchange(half, surface_min, period_min), Exchange(half, surface_min, period_min)
 
 
 class Limit(Block):

@@ -25,15 +25,11 @@ from compensator.model.effects.base import (
     register,
     text,
 )
-from compensator.model.effects.blocks import Block, Exchange, FilterBank, FromStart, S
+from compensator.model.effects.blocks import Block, FilterBank, FromStart, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
-from compensator.model.effects.seen import Seen, digits, quantity, unit_in, unit_of_channel
+from compensator.model.effects.seen import FLOWS, Seen, digits, quantity, unit_in, unit_of_channel
 from compensator.model.effects.signals import Signals
-
-#: Units of what can be nothing but a flow. A fluid that stays as warm as it is shows by its flow alone, and beside any
-#: other channel, such as a speed, that is something else which goes by T_Q.
-FLOWS = ("lpm", "l_per_min", "l_per_h", "m3_per_h", "kg_per_min", "gpm")
 
 
 @register
@@ -53,7 +49,7 @@ class Flow(BankEffect, Effect):
     gain_air: tuple[float, ...] = numbers()
 
     def blocks(self, period_min: float) -> tuple[Block, ...]:
-        films = (Exchange(self.half, self.surface_min, period_min) for _ in range(2))
+        films = exchanges(self.half, self.surface_min, period_min)
         return *films, FromStart(), FromStart(), FilterBank(self.tau_min, (self.gain, self.gain_air), period_min)
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
@@ -84,16 +80,16 @@ class Flow(BankEffect, Effect):
     def half_time_min(self) -> float:
         """Return the time to half of the response at rest to the largest flow, min."""
         kappa = 1.0 / self.half
-        # What is wetted follows with this time constant under the largest flow. Cascaded lags are a sum of lags.
-        follows = self.surface_min / (1.0 + kappa) * (1.0 + 1e-9)
+        # What is wetted follows with this time constant under the largest flow.
+        follows = self.surface_min / (1.0 + kappa)
         if not follows:
             return half_time_min(self.tau_min, self._gains)
-        apart = [kappa / (tau - follows) for tau in self.tau_min]
-        own = [
-            gain * (1.0 + kappa - tau * part) for tau, gain, part in zip(self.tau_min, self._gains, apart, strict=True)
-        ]
-        shared = follows * math.fsum(gain * part for gain, part in zip(self._gains, apart, strict=True))
-        return half_time_min((*self.tau_min, follows), (*own, shared))
+        # Two lags in a row are a sum of two, unless they are the same.
+        taus = [tau if abs(tau - follows) > 1e-5 * follows else follows * (1.0 + 1e-5) for tau in self.tau_min]
+        shares = [kappa * follows / (tau - follows) for tau in taus]
+        own = [gain * (1.0 - share) for gain, share in zip(self._gains, shares, strict=True)]
+        shared = math.fsum(gain * share for gain, share in zip(self._gains, shares, strict=True))
+        return half_time_min((*taus, follows), (*own, shared))
 
     def explain(self, seen: Seen) -> str:
         assert seen.channel is not None
@@ -119,9 +115,10 @@ def flows(context: Context) -> Iterator[Hypothesis]:
     one, several = context.tau(), context.bank_min
     for channel in sorted(context.zeroed):
         is_flow = unit_in(channel) in FLOWS
-        # What resembles a flow only by its zero has enough in common with any temperature without it.
+        # A speed in the place of a flow fits too much if a surface may follow it, too.
         searched = (half, context.surface()) if is_flow else (half,)
         for fluid in context.temperatures:
+            # A fluid that stays as warm as it is shows by its flow alone; with a speed that is something else.
             if fluid not in context.spans and not is_flow:
                 continue
             place: dict[str, Any] = {"channel": channel, "fluid": fluid, "span": context.spans[channel], "half": 1.0}

@@ -22,15 +22,11 @@ import numpy as np
 
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import Block, Exchange, FilterBank, FromStart, Function, Lag, S
-from compensator.model.effects.flow import FLOWS
+from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import Seen, digits, quantity, unit_in
+from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
-
-#: Units of what moves the medium of a film: a speed, or a flow. A power or a load may stand for the heat itself.
-MOVES = ("rpm", "1_per_min", *FLOWS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,20 +147,20 @@ class FilmScheduled(BankScheduled):
     """The same of a film whose surface follows in temperature: the more it carries, the less is left to carry."""
 
     form: str = only(default="film")
+    origin: str = only(default="zero")
     half: float = number(1e-6, 1e6)
     surface_min: float = number(0.0, 1e5)
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
-        """Return the change as `BankScheduled` does, and the time constant of the surface without the film."""
-        return BankScheduled.named(self, given) | {"surface_min": self.surface_min}
+        """Return the change as `BankScheduled` does, and of the surface below the film η and time constant."""
+        return BankScheduled.named(self, given) | {"half": self.half, "surface_min": self.surface_min}
 
     def acting(self, value: float) -> float:
         c = abs(value) / self.span
         return c * (1.0 + self.half) / (c + self.half)
 
     def inner(self, period_min: float) -> tuple[Block, ...]:
-        films = (Exchange(self.half, self.surface_min, period_min) for _ in range(2))
-        return *films, *BankScheduled.inner(self, period_min)
+        return *exchanges(self.half, self.surface_min, period_min), *BankScheduled.inner(self, period_min)
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         c = abs(self.scale(signals, run))

@@ -188,6 +188,12 @@ def unit_of_channel(channel: str) -> str:
     return f"{_UNITS.get(over, over)}/{_UNITS.get(under, under)}" if per else _UNITS.get(over, "")
 
 
+#: Units of what can be nothing but a flow, and of what moves the medium of a film: a speed, or a flow. A power or a
+#: load may stand for the heat itself.
+FLOWS = ("lpm", "l_per_min", "l_per_h", "m3_per_h", "kg_per_min", "gpm")
+MOVES = ("rpm", "1_per_min", *FLOWS)
+
+
 def unit_in(channel: str) -> str:
     """Return the end of a channel's name that is its unit, as in names of parameters; empty if it has one word.
 

@@ -16,6 +16,8 @@ _REFUTED = 12.0
 _Y_SAMPLES = 10
 #: The same by the change since the zero alone. An engine that is wrong agrees with it on its way, but not for so long.
 _Y_ZERO_SAMPLES = 45
+#: So many of them are taken back by one that does not agree: some values are outside of what is expected by chance.
+_Y_MISFIT = 3
 #: Probes that must speak for a channel: one may have met a chip.
 _PROBES = 2
 
@@ -29,13 +31,17 @@ class GrownY(NamedTuple):
         By how Y stood to the prediction before the jump: a model that is wrong by some µm says nothing of the sensor.
     by_zero : float
         By Y at the zero: what was wrong before the jump counts, too.
+    level_std_um, zero_std_um : float
+        Their standard deviations, the noise of Y included, µm: at the zero Y was one value.
     """
 
     by_level: float
     by_zero: float
+    level_std_um: float
+    zero_std_um: float
 
 
-def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY, std_um: float) -> None:
+def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:
     """Count the samples for which measured Y has spoken for one engine.
 
     Parameters
@@ -46,18 +52,17 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY, std_um: float
         The two engines.
     grown : GrownY
         Deformation by measured Y.
-    std_um : float
-        Its standard deviation, µm.
     """
-    if not std_um > 0.0:
+    if not grown.level_std_um > 0.0:
         return
     if not math.isnan(grown.by_level):
-        speaks = engines.speaks(grown.by_level, std_um)
+        speaks = engines.speaks(grown.by_level, grown.level_std_um)
         state.y_for = state.y_for + 1 if speaks > 0 else 0
         state.y_against = state.y_against + 1 if speaks < 0 else 0
     if not math.isnan(grown.by_zero):
-        state.y_zero_for = state.y_zero_for + 1 if engines.speaks(grown.by_zero, std_um) > 0 else 0
-        state.y_fits = state.y_fits + 1 if engines.fits_y(grown.by_zero, std_um) and not state.y_against else 0
+        speaks, fits = (ask(grown.by_zero, grown.zero_std_um) for ask in (engines.speaks, engines.fits_y))
+        state.y_zero_for = state.y_zero_for + 1 if speaks > 0 else 0
+        state.y_fits = max(state.y_fits + (1 if fits and not state.y_against else -_Y_MISFIT), 0)
 
 
 def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um: float) -> None:

@@ -76,6 +76,10 @@ class JumpState(msgspec.Struct, kw_only=True):
         Mean of measured Y − prediction over the last samples, or Y at a zero since a jump, µm; of the watch as a whole.
     zero_um : float
         Measured Y that stands for no deformation by the zero, µm; of the watch as a whole.
+    noise_um2 : float
+        Variance of the noise of Y by the last samples without a jump under way, µm²; of the watch as a whole.
+    last_um : float
+        The last residual of these, µm; NaN if the last sample had none; of the watch as a whole.
     jumps : dict of str to ChannelJump
         By channel that has jumped. Empty if none has.
     steps : int
@@ -120,6 +124,8 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     level_um: float = NAN
     zero_um: float = NAN
+    noise_um2: Number = 0.0
+    last_um: float = NAN
     jumps: dict[str, ChannelJump] = {}
     steps: Count = 0
     again: dict[str, Count] = {}

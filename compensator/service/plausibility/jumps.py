@@ -26,8 +26,9 @@ from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
-#: Weight of a new residual in the level before a jump.
-_LEVEL = 0.1
+#: Weight of a new residual in the level before a jump, and of the difference of two in a row in the noise of Y.
+#: Deviations beyond which a difference is no noise (a chip), and a residual that looks like a fault is no level.
+_LEVEL, _NOISE, _MOST_NOISE = 0.1, 0.02, 5.0
 
 
 class JumpWatch:
@@ -51,6 +52,7 @@ class JumpWatch:
         )
         self._jump = OneJump(self._setup)
         self._level_um = self._zero_um = NAN
+        self._noise_um2, self._last_um = 0.0, NAN
         self._learned_um = 0.0
         self._estimate: Estimate | None = None
 
@@ -88,7 +90,12 @@ class JumpWatch:
     def state(self) -> JumpState:
         """State after the last sample."""
         return msgspec.structs.replace(
-            self._jump.snapshot(), level_um=self._level_um, zero_um=self._zero_um, learned_um=self._learned_um
+            self._jump.snapshot(),
+            level_um=self._level_um,
+            zero_um=self._zero_um,
+            noise_um2=self._noise_um2,
+            last_um=self._last_um,
+            learned_um=self._learned_um,
         )
 
     def restore(self, state: JumpState | None) -> None:
@@ -102,6 +109,7 @@ class JumpWatch:
         state = state or JumpState()
         self._jump = OneJump.restored(self._setup, state)
         self._level_um, self._zero_um = state.level_um, state.zero_um
+        self._noise_um2, self._last_um = max(state.noise_um2, 0.0), state.last_um
         self._learned_um, self._estimate = state.learned_um, None
 
     def set_zero(self, used: Estimate | None, y_um: float) -> None:
@@ -168,7 +176,13 @@ class JumpWatch:
         measured = {name: _measured(channels.get(name)) for name in TEMPERATURES}
         fast = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         before = self._before()
-        grown = GrownY(by_level=y_um - self._level_um, by_zero=y_um - self._zero_um)
+        by_level, by_zero = y_um - self._level_um, y_um - self._zero_um
+        grown = GrownY(
+            by_level=by_level,
+            by_zero=by_zero,
+            level_std_um=self._std_um(),
+            zero_std_um=self._std_um(at_zero=True),
+        )
         found = self._jump.judge(engine, measured, fast, others, grown)
         self._forget(*before)
         return found
@@ -194,7 +208,7 @@ class JumpWatch:
         self._jump.receive_probe(grown_um, math.hypot(std_um, self._setup.y_std_um))
         self._learned_um += learned_um
 
-    def observe(self, y_um: float, zero_um: float, estimate: Estimate) -> None:
+    def observe(self, y_um: float, zero_um: float, estimate: Estimate, *, is_doubted: bool = False) -> None:
         """Count quiet samples, and follow what measured Y is compared with after a later jump.
 
         Parameters
@@ -203,17 +217,32 @@ class JumpWatch:
             Measured Y, and what it is without deformation by the zero, µm; NaN if it is not known.
         estimate : Estimate
             That of the compensation's engine.
+        is_doubted : bool
+            Whether Y − prediction looks like a fault of T_Q or AT: then it is no level of the model.
         """
         self._estimate = estimate
         if not self.is_on or self._jump.is_open:
+            self._last_um = NAN
             return
         self._jump.state.count_quiet()
         self._zero_um = zero_um
+        residual = y_um - estimate.y_um
+        change, self._last_um = residual - self._last_um, residual
+        if not math.isnan(change):
+            most_um = _MOST_NOISE * self._std_um()
+            self._noise_um2 += _NOISE * (min(0.5 * change * change, most_um * most_um) - self._noise_um2)
         if math.isnan(y_um):
             return
-        residual = y_um - estimate.y_um
+        if is_doubted and abs(residual - zero_um) > _MOST_NOISE * self._std_um(at_zero=True):
+            self._level_um = NAN
+            return
         known = not math.isnan(self._level_um)
         self._level_um = self._level_um + _LEVEL * (residual - self._level_um) if known else residual
+
+    def _std_um(self, *, at_zero: bool = False) -> float:
+        """Return the deviation of a value of Y − prediction, µm: own error of the model, and noise of Y."""
+        own_um = self._setup.y_std_um
+        return math.sqrt(own_um * own_um + (2.0 if at_zero else 1.0) * self._noise_um2)
 
     def _before(self) -> tuple[bool, bool]:
         """Return whether a jump is under way, and whether Y − prediction is another one once it is over."""

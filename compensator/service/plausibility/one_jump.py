@@ -70,7 +70,7 @@ class Setup:
     change_k : dict of str to float
         By channel: part of the permitted change of a sample that the temperature itself makes, K.
     y_std_um : float
-        Standard deviation of measured Y − prediction, µm.
+        Standard deviation of Y − prediction without the noise of a value of Y, µm.
     """
 
     model: ThermalModel
@@ -313,7 +313,7 @@ class OneJump:
         engines.step(offered, fed.values | dict.fromkeys(self._beside_suspects, NAN), others, beside.estimate)
         self.state.samples += 1
         self.state.age += 1
-        weigh_y(self.state, engines, grown_y, self._setup.y_std_um)
+        weigh_y(self.state, engines, grown_y)
         estimate: Estimate | None = None
         if beside.gives:
             # What the other channel has shown is undone in the engine that goes on without this one, too.
