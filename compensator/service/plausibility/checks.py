@@ -210,11 +210,6 @@ class PlausibilityCheck:
         return apart + [f"{Reason.IMPLAUSIBLE}:{name}" for name in self.state.suspects]
 
     @property
-    def doubts_temperature(self) -> bool:
-        """Whether a fault of T_Q or AT would explain the residual, and the model's own errors would not."""
-        return not {"t_q_degc", "at_degc"}.isdisjoint(self.state.suspects) and "model" not in self.state.suspects
-
-    @property
     def exchanged(self) -> bool:
         """Whether T_Q and AT seem to be exchanged: no offset is reliable."""
         return self.state.exchanged

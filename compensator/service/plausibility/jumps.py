@@ -26,8 +26,8 @@ from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
-#: Weight of a new residual in the level before a jump, and of the difference of two in a row in the noise of Y.
-#: Deviations beyond which a difference is no noise (a chip), and a residual that looks like a fault is no level.
+#: Weight of a new residual in the level before a jump, and of the difference of two in a row in the noise of Y; at
+#: most so many deviations of it count, for a chip is no noise.
 _LEVEL, _NOISE, _MOST_NOISE = 0.1, 0.02, 5.0
 
 
@@ -208,7 +208,7 @@ class JumpWatch:
         self._jump.receive_probe(grown_um, math.hypot(std_um, self._setup.y_std_um))
         self._learned_um += learned_um
 
-    def observe(self, y_um: float, zero_um: float, estimate: Estimate, *, is_doubted: bool = False) -> None:
+    def observe(self, y_um: float, zero_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow what measured Y is compared with after a later jump.
 
         Parameters
@@ -217,8 +217,6 @@ class JumpWatch:
             Measured Y, and what it is without deformation by the zero, µm; NaN if it is not known.
         estimate : Estimate
             That of the compensation's engine.
-        is_doubted : bool
-            Whether Y − prediction looks like a fault of T_Q or AT: then it is no level of the model.
         """
         self._estimate = estimate
         if not self.is_on or self._jump.is_open:
@@ -232,9 +230,6 @@ class JumpWatch:
             most_um = _MOST_NOISE * self._std_um()
             self._noise_um2 += _NOISE * (min(0.5 * change * change, most_um * most_um) - self._noise_um2)
         if math.isnan(y_um):
-            return
-        if is_doubted and abs(residual - zero_um) > _MOST_NOISE * self._std_um(at_zero=True):
-            self._level_um = NAN
             return
         known = not math.isnan(self._level_um)
         self._level_um = self._level_um + _LEVEL * (residual - self._level_um) if known else residual
