@@ -24,7 +24,7 @@ from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in
+from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in, unit_of_channel
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -152,8 +152,10 @@ class FilmScheduled(BankScheduled):
     surface_min: float = number(0.0, 1e5)
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
-        """Return the change as `BankScheduled` does, and of the surface below the film η and time constant."""
-        return BankScheduled.named(self, given) | {"half": self.half, "surface_min": self.surface_min}
+        """Return the change as `BankScheduled` does, the channel at half of it, and the surface's time constant."""
+        unit = f"_{unit_in(self.channel)}" if unit_of_channel(self.channel) else ""
+        half = {f"half_effect{unit}": self.half * self.span}
+        return BankScheduled.named(self, given) | half | {"surface_min": self.surface_min}
 
     def acting(self, value: float) -> float:
         c = abs(value) / self.span
