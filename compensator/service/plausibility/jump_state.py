@@ -109,7 +109,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     y_zero_for : int
         The same for the believing engine by the change since the zero.
     y_fits : int
-        Consecutive samples for which that agrees with the believing engine, and perhaps with both.
+        Samples for which that agrees with the believing engine, and perhaps with both, less some for each other one.
     probes_for, probes_against : int
         Probes that have spoken for them.
     believing, shifted : Branch, optional
