@@ -361,10 +361,9 @@ class ChainCheck:
         """
         result = self._result
         result.unsigned_behind += 1
-        result.unsigned_samples += topic == "sample"
         if topic in _OF_SAMPLES:
             self._behind[topic] += 1
-            result.unsigned_offsets = max(self._behind.values())
+            result.unsigned_samples, result.unsigned_most = self._behind["sample"], max(self._behind.values())
             own = _TIME.search(body)
             if own is not None and int(own[1]) != time_ns:
                 result.overdue = True
@@ -378,7 +377,7 @@ class ChainCheck:
     def _covered(self, time_ns: int) -> None:
         """Note that everything up to here is signed."""
         result = self._result
-        result.unsigned_behind = result.unsigned_samples = result.unsigned_offsets = 0
+        result.unsigned_behind = result.unsigned_samples = result.unsigned_most = 0
         self._behind.clear()
         result.unsigned_min, result.overdue = 0.0, False
         self._signed_ns = self._covered_ns = time_ns

@@ -34,7 +34,7 @@ class RecordingAudit:
         The first findings, and the number of all findings.
     records : int
         Records in the chain.
-    signed, unsigned_behind, unsigned_samples, unsigned_offsets : int
+    signed, unsigned_behind, unsigned_samples, unsigned_most : int
         Signed seals; after the last of them that is valid records, samples, and those of the kind that is computed in a
         sample of which there are most.
     proven : bool
@@ -92,7 +92,7 @@ class RecordingAudit:
     proven: bool = False
     unsigned_behind: int = 0
     unsigned_samples: int = 0
-    unsigned_offsets: int = 0
+    unsigned_most: int = 0
     unsigned_min: float = 0.0
     overdue: bool = False
     at_head: bool = False
@@ -125,7 +125,7 @@ class RecordingAudit:
         The number of samples and of offsets is bounded as well, because times can be rewritten; it is not bounded to
         one interval, because the clock may have been set back.
         """
-        unsigned_ns = max(self.unsigned_samples, self.unsigned_offsets) * self.period_s * NS
+        unsigned_ns = self.unsigned_most * self.period_s * NS
         recent = not self.overdue and unsigned_ns <= 2 * SEAL_EVERY_NS
         return recent and self.end in (RecordingEnd.OPEN, RecordingEnd.TORN)
 

@@ -53,20 +53,22 @@ def test_a_mended_channel_is_used_again_where_y_has_more_noise_than_the_model_er
         fault(i, values)
         values["y_um"] += float(noise[i])
 
-    conf = settings({"residual_std_um": 0.06, "false_alarm_days": 30.0, "sensor_must_fit": True})
-    compensation, outcomes = Compensation(conf, QUILL), []
-    for i in range(len(day["t_s"])):
-        values = readings(day, i)
-        change(i, values)
-        outcomes.append(compensation.process(sample(i, values)))
+    outcomes = followed(day, change, residual_std_um=0.06, false_alarm_days=30.0, sensor_must_fit=True)
     assert any("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[begin:])
     wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
     assert not wrong[end + 90 :].any() and not any(o.offset.state == "hold" for o in outcomes[end + 90 :])
 
 
-def followed(day: dict[str, np.ndarray], change: Change, *, restart: int | None = None) -> list[Outcome]:
-    """Run with a Y whose deviation hides a small jump; perhaps with a restart."""
-    conf = settings({"residual_std_um": 2.3})
+def followed(
+    day: dict[str, np.ndarray],
+    change: Change,
+    *,
+    restart: int | None = None,
+    residual_std_um: float = 2.3,
+    **checks: float,
+) -> list[Outcome]:
+    """Run with a Y whose deviation hides a small jump, or with another one; perhaps with a restart."""
+    conf = settings({"residual_std_um": residual_std_um, **checks})
     compensation, outcomes = Compensation(conf, QUILL), []
     for i in range(len(day["t_s"])):
         if i == restart:

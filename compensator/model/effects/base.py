@@ -196,8 +196,7 @@ class Effect:
     @property
     def time_constants_min(self) -> tuple[float, ...]:
         """Time constants, min: how long its state remembers."""
-        tau = getattr(self, "tau_min", ())
-        return tau if isinstance(tau, tuple) else (tau,)
+        return tuple(tau for key in ("tau_min", "surface_min") for tau in _numbers(getattr(self, key, ())))
 
     @property
     def lateness(self) -> Lateness | None:

@@ -28,7 +28,7 @@ from compensator.model.effects.base import (
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
-from compensator.model.effects.seen import FLOWS, Seen, digits, quantity, unit_in, unit_of_channel
+from compensator.model.effects.seen import FLOWS, Seen, digits, quantity, unit_in, with_unit
 from compensator.model.effects.signals import Signals
 
 
@@ -62,15 +62,10 @@ class Flow(BankEffect, Effect):
     def channels(self) -> tuple[str, ...]:
         return self.channel, self.fluid
 
-    @property
-    def time_constants_min(self) -> tuple[float, ...]:
-        return *self.tau_min, self.surface_min
-
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest by the fluid's temperature at the largest flow, the time to half of it, and h."""
         found = {"gain_um_per_k": math.fsum(self._gains), "half_time_min": self.half_time_min()}
-        unit = f"_{unit_in(self.channel)}" if unit_of_channel(self.channel) else ""
-        return found | {f"half_flow{unit}": self.half * self.span}
+        return found | {with_unit("half_flow", self.channel): self.half * self.span}
 
     @property
     def _gains(self) -> tuple[float, ...]:

@@ -24,7 +24,7 @@ from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in, unit_of_channel
+from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in, with_unit
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -153,8 +153,7 @@ class FilmScheduled(BankScheduled):
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the change as `BankScheduled` does, the channel at half of it, and the surface's time constant."""
-        unit = f"_{unit_in(self.channel)}" if unit_of_channel(self.channel) else ""
-        half = {f"half_effect{unit}": self.half * self.span}
+        half = {with_unit("half_effect", self.channel): self.half * self.span}
         return BankScheduled.named(self, given) | half | {"surface_min": self.surface_min}
 
     def acting(self, value: float) -> float:
@@ -167,10 +166,6 @@ class FilmScheduled(BankScheduled):
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         c = abs(self.scale(signals, run))
         return run[1](c, signals.source_from_rest(self.path)), run[2](c, signals.share_from_rest(self.path))
-
-    @property
-    def time_constants_min(self) -> tuple[float, ...]:
-        return *self.tau_min, self.surface_min
 
 
 @proposes

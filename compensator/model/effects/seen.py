@@ -205,3 +205,14 @@ def unit_in(channel: str) -> str:
     words, per, under = channel.partition("_per_")
     before, _, unit = words.rpartition("_")
     return f"{unit}{per}{under}" if before else ""
+
+
+def with_unit(name: str, channel: str) -> str:
+    """Return the name of a parameter with the unit of a channel, where that has one.
+
+    Examples
+    --------
+    >>> with_unit("half_flow", "coolant_l_per_min"), with_unit("half_flow", "coolant_flow")
+    ('half_flow_l_per_min', 'half_flow')
+    """
+    return f"{name}_{unit_in(channel)}" if unit_of_channel(channel) else name

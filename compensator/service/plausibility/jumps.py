@@ -176,10 +176,9 @@ class JumpWatch:
         measured = {name: _measured(channels.get(name)) for name in TEMPERATURES}
         fast = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         before = self._before()
-        by_level, by_zero = y_um - self._level_um, y_um - self._zero_um
         grown = GrownY(
-            by_level=by_level,
-            by_zero=by_zero,
+            by_level=y_um - self._level_um,
+            by_zero=y_um - self._zero_um,
             level_std_um=self._std_um(),
             zero_std_um=self._std_um(at_zero=True),
         )
