@@ -124,8 +124,9 @@ def without_outliers(
 ) -> tuple[Vector, int]:
     """Replace outliers, readings far from all that is beside them, by NaN.
 
-    A step stays: its samples are near one of their neighbours. The first and last reading of a stretch have neighbours
-    on one side only; they are outliers where these are together, and the signal has no such step elsewhere.
+    A step stays: its samples are near one of their neighbours. On a slope, what is beside a reading is not at one place
+    but on one line. The first and last reading of a stretch have neighbours on one side only; they are outliers where
+    these are together, and the signal has no such step elsewhere.
 
     Parameters
     ----------
@@ -150,7 +151,12 @@ def without_outliers(
     noise = noise_std(v)
     # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
     limit = OUTLIER_DEVIATIONS * noise + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
-    outliers = np.unique(np.concatenate([_apart(v, known, count, limit) for count in range(1, in_a_row + 1)]))
+    counts = range(1, in_a_row + 1)
+    found = [_apart(v, known, count, limit) for count in counts]
+    # What is commanded may come and go within a sample, and what was computed has no wrong readings.
+    if (first or last) and noise > 0.0:
+        found += [_off_line(v, known, count, OUTLIER_DEVIATIONS * noise) for count in counts]
+    outliers = np.unique(np.concatenate(found))
     if noise > 0.0:  # what was computed has no wrong readings, but may begin with a step
         known = np.setdiff1d(known, outliers)
         ends = [end for end, asked in ((_first_alone, first), (_last_alone, last)) if asked]
@@ -182,6 +188,40 @@ def _apart(v: Vector, known: Indices, count: int, limit: float) -> Indices:
         apart[0] = apart[-1] = False
         apart[1:-1] &= np.ptp(beside, axis=1) < limit
     return np.asarray(known[(np.flatnonzero(apart)[:, None] + 1 + np.arange(count)).ravel()])
+
+
+def _off_line(v: Vector, known: Indices, count: int, noise: float) -> Indices:
+    """Return where so many readings in a row are far from the line through the two on each side of them.
+
+    These have to be on it, and the readings beyond both beside them: a corner of the signal is neither.
+
+    Parameters
+    ----------
+    v, known : numpy.ndarray, shape (n,)
+        The readings and their samples.
+    count : int
+        Readings in a row.
+    noise : float
+        Largest distance from the line that noise makes.
+    """
+    if v.size < count + 4:
+        return np.empty(0, dtype=np.intp)
+    windows = sliding_window_view(v, count + 4)
+    rows, beside = windows[:, 2:-2], np.delete(windows, np.s_[2:-2], axis=1)
+    at = np.delete(np.arange(count + 4.0), np.s_[2:-2])
+    design = np.column_stack([np.ones(4), at])
+    lines = beside @ np.linalg.pinv(design).T
+    uneven = np.max(np.abs(beside - lines @ design.T), axis=1)
+    off = rows - (lines[:, :1] + lines[:, 1:] * np.arange(2.0, count + 2.0))
+    distance = np.maximum(np.min(off, axis=1), np.min(-off, axis=1))
+    beyond = np.maximum(
+        np.min(rows, axis=1) - np.max(beside[:, 1:3], axis=1), np.min(beside[:, 1:3], axis=1) - np.max(rows, axis=1)
+    )
+    # What the signal does at one of twenty samples is no outlier.
+    limit = noise + 3.0 * float(np.quantile(np.abs(np.median(off, axis=1)), 0.95)) + 1e-9
+    apart = (np.minimum(distance, beyond) > limit) & (uneven < TOGETHER * limit)
+    apart &= known[count + 3 :] - known[: -count - 3] == count + 3
+    return np.asarray(known[(np.flatnonzero(apart)[:, None] + 2 + np.arange(count)).ravel()])
 
 
 def _first_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:

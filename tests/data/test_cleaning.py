@@ -46,6 +46,36 @@ def test_a_wrong_reading_goes_wherever_it_stands(column, size, row):
     assert [remark.code for remark in data.remarks] == ["wild_readings"]
 
 
+def switched(rate=2.5, noise=0.2, seed=4):
+    """Return a displacement that rises and falls by turns for half an hour each, and where it turns."""
+    turns = np.arange(30, 600, 30)
+    slope = np.full(600, rate)
+    for at in turns:
+        slope[at:] *= -1.0
+    return np.cumsum(slope) + np.random.default_rng(seed).normal(0.0, noise, 600), turns
+
+
+@pytest.mark.parametrize(("rows", "size"), [([310], -10.0), ([345], 9.0), ([315, 316], -25.0)])
+def test_a_wrong_reading_on_a_slope_goes_and_the_corners_stay(rows, size):
+    """−10 µm where Y moves by 2.5 µm a minute: near what is beside it, and far from the line through that."""
+    values, turns = switched()
+    assert without_outliers(values, first=True, last=True, in_a_row=2)[1] == 0
+    values[rows] += size
+    kept, count = without_outliers(values, first=True, last=True, in_a_row=2)
+    assert np.flatnonzero(np.isnan(kept)).tolist() == rows
+    assert count == len(rows)
+    values[turns[3] + 1] += 20.0  # at a corner there is no line, but this is far from both sides
+    assert np.isnan(without_outliers(values, first=True, last=True, in_a_row=2)[0][turns[3] + 1])
+
+
+def test_a_step_on_a_slope_and_a_step_in_two_samples_are_no_wrong_readings():
+    for size, samples in ((9.0, 1), (9.0, 2), (-9.0, 1), (-9.0, 2)):
+        values, _ = switched()
+        values[310:] += size
+        values[310 : 310 + samples - 1] -= size / 2.0
+        assert without_outliers(values, first=True, last=True, in_a_row=2)[1] == 0
+
+
 def test_a_wrong_first_reading_is_not_the_zero_of_a_simulation():
     table = machine()
     right = tc.simulate("quill", table)["y_pred_um"]

@@ -144,6 +144,7 @@ def test_a_couple_that_is_heated_for_two_minutes_is_no_disturbance(tau_min):
     means = lfilter([1.0 - keep], [1.0, -keep], heat).reshape(-1, 4).mean(axis=1)
     values = 20.0 + means + np.random.default_rng(5).normal(0.0, 0.02, 7200)
     assert without_outliers(values, in_a_row=2)[1] == without_outliers(values)[1]
+    assert without_outliers(values, first=True, last=True, in_a_row=2)[1] == without_outliers(values)[1]
 
 
 def test_two_readings_between_gaps_are_no_disturbance():
