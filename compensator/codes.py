@@ -291,8 +291,9 @@ class ProbeCode(Code):
     )
     DURING_HOLD = (
         "probe_during_hold",
-        "The offset was held at the time of the probe.",
-        "Correct the cause of the hold; then probe again.",
+        "The offset was held at the time of the probe: nothing is corrected by it, but it speaks for or against a "
+        "suspect T_Q or AT.",
+        "Correct the cause of the hold; then probe again. If a channel is suspect that is right, two probes show it.",
     )
     MISMATCH = (
         "probe_mismatch",

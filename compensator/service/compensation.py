@@ -229,16 +229,14 @@ class Compensation(Continuity):
         every: list[Probe] = []
         for received in probes:
             before_um = self._prediction().y_um
-            decided, found = self.probing.decide(raw.machine, raw.seq, [received])
-            notes += found
-            every += decided
+            probe, note, shown_um = self.probing.decide(raw.machine, raw.seq, received)
+            notes.append(note)
+            every.append(probe)
             if self._config.probe is None or self._memory.estimate is None:
                 continue
             learned_um = self._prediction().y_um - before_um
-            for probe in decided:
-                std_um = probe.std_um if probe.std_um is not None else self._config.probe.std_um
-                innovation_um = number(probe.innovation_um)
-                self._jumps.receive_probe(innovation_um, std_um, self._memory.estimate.y_um, learned_um)
+            std_um = probe.std_um if probe.std_um is not None else self._config.probe.std_um
+            self._jumps.receive_probe(shown_um, std_um, self._memory.estimate.y_um, learned_um)
         return tuple(every)
 
     def _evidence(self, raw: Sample, values: Values, prediction: Prediction) -> SensorEvidence:

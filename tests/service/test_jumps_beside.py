@@ -14,10 +14,11 @@ import pytest
 from compensator.config import Probe
 from compensator.errors import DataError
 from compensator.messages import Offset, ProbeRequest, encode, number
-from compensator.service.compensation import Compensation
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.probing import ReceivedProbe
 from tests.service.jumping import (
     BEGIN,
+    CHANNELS,
     END,
     Change,
     events,
@@ -212,6 +213,54 @@ def test_probes_that_are_right_never_confirm_a_sensor_that_is_wrong(day: dict[st
     asked = {"suspect_channel:at_degc", "unconfirmed_channel:at_degc"}
     assert all(asked & set(reasons[i]) for i in range(BEGIN + 2, END))
     assert "suspect_channel:at_degc" in reasons[BEGIN + 50]
+
+
+def probed_day(
+    day: dict[str, np.ndarray], probes: dict[int, float], *, rate_max: float = 5.0, fault_k: float = 0.0
+) -> list[Outcome]:
+    """Run a day without measured Y: probes by sample with what each is wrong by, T_Q off by a fault from BEGIN on."""
+    probe = Probe(std_um=1.0, measured_max_um=200.0, largest_um=40.0, tolerance_um=3.0)
+    channels = [c | {"rate_max_per_min": rate_max} if c["name"] == "t_q_degc" else c for c in CHANNELS]
+    compensation = Compensation(msgspec.structs.replace(settings(channel=channels), probe=probe), QUILL)
+    outcomes: list[Outcome] = []
+    last = None
+    for i in range(END):
+        values = readings(day, i)
+        truth_um = values["y_um"] - float(day["y_um"][0])
+        values["y_um"] = math.nan
+        values["t_q_degc"] += fault_k if i >= BEGIN else 0.0
+        if i in probes:
+            last = probed(truth_um + probes[i], outcomes[-1].offset)
+        if i in probes or i - 1 in probes:  # each arrives twice
+            assert last is not None
+            compensation.receive_probes([last])
+        outcomes.append(compensation.process(sample(i, values)))
+    return outcomes
+
+
+def test_probes_while_the_offset_is_held_end_the_doubt_of_a_channel_that_is_right(day: dict[str, np.ndarray]) -> None:
+    """T_Q heats faster than permitted, so it is suspected; the offset is held, and 80 µm wrong by then."""
+    hourly = {30: 0.0, 90: 0.0, 150: 0.0, 210: 0.0}
+    outcomes = probed_day(day, hourly, rate_max=0.5)
+    states = [o.offset.state for o in outcomes]
+    assert states[60] == states[150] == "hold", states[60:152]
+    assert [p.code for o in outcomes[90:160] for p in o.probes] == 2 * ["probe_during_hold", "probe_duplicate"]
+    assert {o.offset.state for o in outcomes[155:260]} == {"degraded"}
+    wrong_um = np.abs(offsets(outcomes) - undisturbed()[:END])
+    assert np.max(wrong_um[100:140]) > 40.0 and np.max(wrong_um[160:260]) < 5.0
+    # One that has met a chip is not one of two.
+    chip = probed_day(day, hourly | {90: 15.0}, rate_max=0.5)
+    assert chip[155].offset.state == "hold" and chip[215].offset.state == "degraded"
+
+
+@pytest.mark.parametrize("fault_k", [6.0, -6.0, 2.5])
+def test_probes_while_the_offset_is_held_speak_against_a_sensor_that_is_wrong(
+    day: dict[str, np.ndarray], fault_k: float
+) -> None:
+    hourly = dict.fromkeys(range(60, END, 60), 0.0)
+    outcomes = probed_day(day, hourly, fault_k=fault_k)
+    assert [p.code for o in outcomes for p in o.probes].count("probe_during_hold") >= 2
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 2 :])
 
 
 @pytest.mark.parametrize("samples", [1, 2])

@@ -208,6 +208,24 @@ class ProbeCorrection:
         self._mix()
         return ProbeVerdict(True, reason, innovation, math.sqrt(variance))
 
+    def innovation(
+        self, y_um: float, std_um: float, predicted_um: float, contributions_um: Sequence[float], feature: str = ""
+    ) -> tuple[float, float]:
+        """Return what a probe shows beyond the prediction, and its standard deviation, µm, without correcting by it.
+
+        Parameters
+        ----------
+        y_um, std_um, predicted_um, contributions_um, feature
+            As `update` has them.
+
+        Raises
+        ------
+        ValueError
+            As `update`.
+        """
+        found = ProbeCorrection.from_dict(self.to_dict()).update(y_um, std_um, predicted_um, contributions_um, feature)
+        return found.innovation_um, found.innovation_std_um
+
     def _expect(self, contributions_um: Sequence[float]) -> None:
         if len(contributions_um) != len(self.names):
             raise ValueError(f"{len(contributions_um)} contributions, expected one for each of {list(self.names)}")

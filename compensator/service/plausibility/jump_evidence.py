@@ -20,6 +20,8 @@ _Y_ZERO_SAMPLES = 45
 _Y_MISFIT = 3
 #: Probes that must speak for a channel: one may have met a chip.
 _PROBES = 2
+#: So soon after a jump both engines agree, and a probe that fits says nothing.
+_APART_SAMPLES = 10
 
 
 class GrownY(NamedTuple):
@@ -72,6 +74,8 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
     speaks = engines.speaks(grown_um, std_um)
     state.probes_for += speaks > 0
     state.probes_against += speaks < 0
+    if state.age >= _APART_SAMPLES:
+        state.probes_fit = state.probes_fit + 1 if engines.fits_y(grown_um, std_um) else 0
 
 
 def confirmed_by(state: JumpState) -> str:
@@ -86,8 +90,8 @@ def confirmed_by(state: JumpState) -> str:
 
 
 def is_good_enough(state: JumpState) -> bool:
-    """Return whether measured Y has agreed with the believing engine for long, though perhaps with both."""
-    return state.y_fits >= _Y_ZERO_SAMPLES
+    """Return whether measured Y, or probes, have agreed with the believing engine for long, perhaps with both."""
+    return state.y_fits >= _Y_ZERO_SAMPLES or state.probes_fit >= _PROBES
 
 
 def is_contradicted(state: JumpState) -> bool:

@@ -20,7 +20,7 @@ UNSEEN, RESTED, AIR = "after samples without it", "now that it is at rest", "and
 BESIDE, LEFT, FITS = (
     "while another channel is in question",
     "after most of its jump is gone",
-    "too little for measured Y to tell",
+    "too little for measured Y or probes to tell",
 )
 
 NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}

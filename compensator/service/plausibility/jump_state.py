@@ -112,6 +112,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Samples for which that agrees with the believing engine, and perhaps with both, less some for each other one.
     probes_for, probes_against : int
         Probes that have spoken for them.
+    probes_fit : int
+        Probes in a row that agree with the believing engine, and perhaps with both.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
     learned_um : float
@@ -144,6 +146,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     y_zero_for: Count = 0
     y_fits: Count = 0
     probes_for: Count = 0
+    probes_fit: Count = 0
     probes_against: Count = 0
     believing: Branch | None = None
     shifted: Branch | None = None
@@ -207,7 +210,7 @@ class JumpState(msgspec.Struct, kw_only=True):
         """Count the evidence from here on."""
         self.samples, self.ratio = 0, 0.0
         self.y_for = self.y_against = self.y_zero_for = self.y_fits = 0
-        self.probes_for = self.probes_against = 0
+        self.probes_for = self.probes_against = self.probes_fit = 0
 
     def suspect(self, phase: Phase = Phase.SUSPECT) -> None:
         """Use the channels no longer that were watched or unconfirmed."""

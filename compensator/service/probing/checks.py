@@ -98,10 +98,12 @@ def _check_offset(probe: ReceivedProbe, state: ProbingState, settings: ProbeSett
     then = published_at(samples, request.time_utc_ns, period_s)
     if then is None:
         raise ProbeRefused(ProbeCode.TIME_UNKNOWN, f"probe of {when}: no offset was valid at that time")
-    if then.is_held:
-        raise ProbeRefused(ProbeCode.DURING_HOLD, f"probe of {when}: the offset was held at {then.offset_um:.2f} µm")
     low, high = offsets_at(samples, request.time_utc_ns, period_s)
-    if not low - settings.match_um <= request.offset_applied_um <= high + settings.match_um:
+    matches = low - settings.match_um <= request.offset_applied_um <= high + settings.match_um
+    if then.is_held:
+        text = f"probe of {when}: the offset was held at {then.offset_um:.2f} µm"
+        raise ProbeRefused(ProbeCode.DURING_HOLD, text, is_comparable=matches)
+    if not matches:
         published = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
         raise ProbeRefused(
             ProbeCode.MISMATCH,

@@ -25,7 +25,7 @@ from compensator.messages import Probe
 from compensator.model.correction import ProbeCorrection
 from compensator.service.probing.checks import check_probe
 from compensator.service.probing.past import predicted_at
-from compensator.service.probing.received import ProbeRefused, ReceivedProbe, Verdict, recorded_probe
+from compensator.service.probing.received import UNKNOWN_UM, ProbeRefused, ReceivedProbe, Verdict, recorded_probe
 from compensator.service.probing.state import KnownProbe, PastSample, ProbingState
 from compensator.service.probing.wanted import Wanted, wanted_after
 
@@ -244,26 +244,29 @@ class Probing:
             period_s=self._period_s,
         )
 
-    def decide(self, machine: str, seq: int, probes: Sequence[ReceivedProbe]) -> tuple[list[Probe], list[Note]]:
-        """Decide the probes that arrived since the last sample; return their records and events."""
-        records, notes = [], []
-        for probe in probes:
-            verdict = self._decide(probe)
-            record = recorded_probe(machine, seq, probe, verdict)
-            records.append(record)
-            compared = not math.isnan(verdict.innovation_um)
-            data = ProbeData(
-                taken=record.taken,
-                code=record.code,
-                probe_utc_ns=record.time_utc_ns,
-                feature=record.feature,
-                innovation_um=record.innovation_um if compared else None,
-                innovation_std_um=record.innovation_std_um if compared else None,
-                by=record.by,
-                by_proof=record.by_proof,
-            )
-            notes.append(Note(EventKind.PROBE, verdict.text, data.table()))
-        return records, notes
+    def decide(self, machine: str, seq: int, probe: ReceivedProbe) -> tuple[Probe, Note, float]:
+        """Decide a probe that arrived since the last sample.
+
+        Returns
+        -------
+        Probe, Note, float
+            Its record, its event, and what it shows beyond the prediction, µm: known also of a probe that was right but
+            came while the offset was held, by which nothing is corrected; NaN if not known.
+        """
+        verdict = self._decide(probe)
+        record = recorded_probe(machine, seq, probe, verdict)
+        compared = not math.isnan(verdict.innovation_um)
+        data = ProbeData(
+            taken=record.taken,
+            code=record.code,
+            probe_utc_ns=record.time_utc_ns,
+            feature=record.feature,
+            innovation_um=record.innovation_um if compared else None,
+            innovation_std_um=record.innovation_std_um if compared else None,
+            by=record.by,
+            by_proof=record.by_proof,
+        )
+        return record, Note(EventKind.PROBE, verdict.text, data.table()), verdict.shown_um
 
     def _decide(self, probe: ReceivedProbe) -> Verdict:
         try:
@@ -271,24 +274,33 @@ class Probing:
         except ProbeRefused as refused:
             if refused.code not in _NOT_ASKED:
                 self._state.refused = refused.code
-            return Verdict(taken=False, code=refused.code, text=str(refused))
-        request, samples = probe.request, self._state.samples
-        predicted = predicted_at(samples, request.time_utc_ns, self._period_s)
-        assert predicted is not None
-        std_um = request.std_um if request.std_um is not None else self._settings.std_um
-        deformation_um = request.measured_um - request.offset_applied_um
-        found = self._correction.update(
-            deformation_um,
-            math.hypot(std_um, predicted.noise_um),
-            predicted.y_um,
-            predicted.contributions_um,
-            request.feature,
-        )
-        self._state.known = [*self._state.known[1 - _KNOWN :], _known(probe)]
+            shown_um = NAN
+            if refused.is_comparable:
+                innovation_um, std_um = self._correction.innovation(*self._compared(probe))
+                shown_um = innovation_um if std_um < UNKNOWN_UM else NAN
+                self._remember(probe)
+            return Verdict(taken=False, code=refused.code, text=str(refused), shown_um=shown_um)
+        request = probe.request
+        deformation_um, std_um, predicted_um, contributions_um, feature = self._compared(probe)
+        found = self._correction.update(deformation_um, std_um, predicted_um, contributions_um, feature)
+        self._remember(probe)
         if request.feature not in self._state.features:
             self._state.features = [*self._state.features, request.feature]
         self._state.refused = "" if found.taken else ProbeCode.OUTLIER
-        return Verdict.of(found, deformation_um, predicted.y_um)
+        return Verdict.of(found, deformation_um, predicted_um)
+
+    def _remember(self, probe: ReceivedProbe) -> None:
+        self._state.known = [*self._state.known[1 - _KNOWN :], _known(probe)]
+
+    def _compared(self, probe: ReceivedProbe) -> tuple[float, float, float, tuple[float, ...], str]:
+        """Return what the correction compares: deformation, its deviation, prediction with its shares, feature."""
+        request = probe.request
+        predicted = predicted_at(self._state.samples, request.time_utc_ns, self._period_s)
+        assert predicted is not None
+        std_um = request.std_um if request.std_um is not None else self._settings.std_um
+        deformation_um = request.measured_um - request.offset_applied_um
+        noise_um = math.hypot(std_um, predicted.noise_um)
+        return deformation_um, noise_um, predicted.y_um, predicted.contributions_um, request.feature
 
     def wanted(self, y_std_um: float) -> Wanted:
         """Return whether, by when and why a probe is wanted after the last sample.

@@ -20,11 +20,21 @@ UNKNOWN_UM = 200.0
 
 
 class ProbeRefused(ServiceError):
-    """A probe that is refused; `code` says why."""
+    """A probe that is refused.
 
-    def __init__(self, code: ProbeCode, text: str) -> None:
+    Parameters
+    ----------
+    code : ProbeCode
+        Why.
+    text : str
+        The same in words.
+    is_comparable : bool
+        Whether it is right all the same, and can be compared with predictions.
+    """
+
+    def __init__(self, code: ProbeCode, text: str, *, is_comparable: bool = False) -> None:
         super().__init__(text)
-        self.code = code
+        self.code, self.is_comparable = code, is_comparable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +86,10 @@ class ReceivedProbe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What was made of a probe; NaN where it was refused before it was compared with the prediction."""
+    """What was made of a probe; NaN where it was refused before it was compared with the prediction.
+
+    `shown_um` is what it shows beyond the prediction, whether it was taken or not; NaN where that is not known.
+    """
 
     taken: bool
     code: str
@@ -84,6 +97,7 @@ class Verdict:
     predicted_um: float = NAN
     innovation_um: float = NAN
     innovation_std_um: float = NAN
+    shown_um: float = NAN
 
     @classmethod
     def of(cls, found: ProbeVerdict, deformation_um: float, predicted_um: float) -> Verdict:
@@ -101,6 +115,7 @@ class Verdict:
             predicted_um=predicted_um,
             innovation_um=found.innovation_um,
             innovation_std_um=std_um,
+            shown_um=found.innovation_um,
         )
 
 
