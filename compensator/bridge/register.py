@@ -72,6 +72,8 @@ class Registers(ABC):
         if not self._known:
             return self._continue_from(values)
         if self._written is None or not (differ := self._differ(values, self._written)):
+            # Another program that has put the old value back is none any more, and its next value is a new one.
+            self.trouble, self._found = "", None
             return True
         if self._found is None or self._differ(values, self._found[0]):
             self._found = (values, now_s)

@@ -212,9 +212,7 @@ class AxesFollower(Modes[Sample]):
             rate = min(rate, self._fade_rate_um_per_min)
         step_um = rate * step_s / 60.0
         if one.state == "following" and not cutting:
-            extra_um = self._levers.faster_um(mover.owed_um, rate, step_s)
-            mover.owed_um -= extra_um
-            step_um += extra_um
+            step_um += mover.pay(one.targets_um, self._levers.faster_um(rate, step_s))
         one.arrived = mover.move(one.targets_um, step_um)
         if one.state == "fading":
             one.reasons.append(Reason("fading" if any(mover.ends_um) else "faded"))
@@ -255,7 +253,7 @@ class AxesFollower(Modes[Sample]):
             angle = (tilt.offset or 0.0) + tilt.rate_per_min * minutes
             angle = _limited(angle, self._tilts[tilt.axis].offset_max_urad, "µrad", reasons)
             added_um, change_um = self._levers.follow(tilt, angle)
-            mover.owe(change_um)
+            mover.owe(limits.sign * change_um)
             base_um += added_um
         slope = message.slope_um_per_m + message.slope_rate_um_per_m_per_min * minutes
         if limits.has_slope:

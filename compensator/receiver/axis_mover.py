@@ -53,7 +53,7 @@ class AxisMover:
     places_mm, ends_um : tuple of float, shape (1,) or (2,)
         Ends of the travel, mm, and the offset there, µm; without a slope a single one.
     owed_um : float
-        What the change of the tool's length has left to move, µm.
+        What the changes of the tool's length have left to move, and in which direction, µm.
 
     Raises
     ------
@@ -152,8 +152,24 @@ class AxisMover:
         self.ends_um = shifted if all(abs(end) <= most for end in shifted) else (offset_um,) * len(shifted)
 
     def owe(self, change_um: float) -> None:
-        """Add what a new tool asks for, µm; no more than the whole range."""
-        self.owed_um = min(self.owed_um + abs(change_um), 2.0 * self.limits.offset_max_um)
+        """Add what a new tool asks for, µm; a length that goes and comes back asks for nothing."""
+        most = 2.0 * self.limits.offset_max_um
+        self.owed_um = max(-most, min(most, self.owed_um + change_um))
+
+    def pay(self, targets_um: Sequence[float], most_um: float) -> float:
+        """Return how much further than its step the axis moves because of a new tool, µm; it is owed no more.
+
+        Parameters
+        ----------
+        targets_um : sequence of float, shape (1,) or (2,)
+            Where the ends go, µm: only what leads there is paid.
+        most_um : float
+            What the rate at a tool change permits, µm.
+        """
+        leads_there = any((t - e) * self.owed_um > 0.0 for e, t in zip(self.ends_um, targets_um, strict=True))
+        paid_um = min(abs(self.owed_um), most_um) if leads_there else 0.0
+        self.owed_um -= math.copysign(paid_um, self.owed_um)
+        return paid_um
 
     def move(self, targets_um: Sequence[float], step_um: float) -> bool:
         """Move each end by one step; return whether all have arrived.

@@ -61,13 +61,11 @@ class Levers:
             wrong_um += sign * (tilt.offset or 0.0) * change_mm / 1000.0
         return [Reason("tool_changed", f"{wrong_um:+.2f} µm")] if abs(wrong_um) > ARRIVED_UM else []
 
-    def faster_um(self, owed_um: float, rate_um_per_min: float, step_s: float) -> float:
-        """Return how much further than its rate an axis may move while the tool does not cut, µm.
+    def faster_um(self, rate_um_per_min: float, step_s: float) -> float:
+        """Return how much further than its rate an axis may move for a new tool while nothing cuts, µm.
 
         Parameters
         ----------
-        owed_um : float
-            What the change of the tool's length has left to move, µm.
         rate_um_per_min : float
             Rate of the axis, µm/min.
         step_s : float
@@ -75,8 +73,7 @@ class Levers:
         """
         if self._limits is None:
             return 0.0
-        faster = max(self._limits.rate_at_tool_change_um_per_min - rate_um_per_min, 0.0)
-        return min(owed_um, faster * step_s / 60.0)
+        return max(self._limits.rate_at_tool_change_um_per_min - rate_um_per_min, 0.0) * step_s / 60.0
 
     def _length_of(self, tilt: AxisMessage) -> float:
         return tilt.reference_mm if self._length_mm is None else self._length_mm

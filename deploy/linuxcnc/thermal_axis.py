@@ -154,9 +154,17 @@ class Axis:
         )
 
     def found_um(self) -> float:
-        """Return the offset that the axis has already; 0 while the machine is off, when its pins show an old one."""
-        view = self.view()
-        return view.request_um if view.ready else 0.0
+        """Return the offset that the axis has already.
+
+        It is 0 while the machine is off, not homed or cleared, when the pins show an old one. In joint mode and without
+        `eoffset-enable` it acts, although no change of it is taken.
+        """
+        acts = (
+            hal.get_value("motion.motion-enabled")
+            and hal.get_value("motion.is-all-homed")
+            and not hal.get_value(f"{self.name}.eoffset-clear")
+        )
+        return self.view().request_um if acts else 0.0
 
 
 class Output:

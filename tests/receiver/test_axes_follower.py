@@ -277,6 +277,21 @@ def test_at_a_tool_change_the_length_alone_moves_faster_and_only_while_nothing_c
     assert um(run(f, 35.0, 1.0, free)[-1]) == (pytest.approx(8.1),)  # a new offset is no tool change
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "lengths_mm", [[300.0] + 99 * [100.0], 50 * [101.0, 100.0], 50 * [100.0, 101.0], 10 * [300.0] + 90 * [100.0]]
+)
+def test_a_length_that_goes_and_comes_back_lets_nothing_catch_up_faster(sign: int, lengths_mm: list[float]) -> None:
+    """The axis catches up by 60 µm at its rate; what a flicker of the length asks for and takes back adds nothing."""
+    f = tilting(ToolLimits(length_min_mm=20.0, length_max_mm=400.0, rate_at_tool_change_um_per_min=120.0), sign)
+    sample(f, 30.0, 2, y={"value": 62.0, "valid_for_s": 600.0}, a={"value": 40.0, "valid_for_s": 600.0})
+    before = sign * 2.0
+    for i, length_mm in enumerate(lengths_mm):
+        last = f.advance(30.0 + 0.2 * (i + 1), ControlState(tool_length_mm=length_mm, cutting=False))
+    # At most what the longest time with another length may have moved for it.
+    assert abs(um(last)[0] - before) < RATE * 20.0 / 60.0 + 2.0 * 2.01
+
+
 def test_after_a_fade_nothing_moves_faster_whatever_tool_there_is() -> None:
     f = tilting(ToolLimits(length_min_mm=20.0, length_max_mm=400.0, rate_at_tool_change_um_per_min=120.0))
     f.fade(RATE)
