@@ -280,6 +280,30 @@ def test_exchanged_at_the_start_is_seen_once_heat_has_come_and_latched(day: dict
     assert largest_step(outcomes) <= 8.0 + 1e-9
 
 
+@pytest.mark.parametrize("has_y", [True, False])
+def test_measured_y_ends_an_exchange_that_is_over(day: dict[str, np.ndarray], has_y: bool) -> None:
+    """The wires are right again on a warm machine; without Y, and while they are not, a person has to say so."""
+    begin, end = 150, 330
+
+    def exchanged(i: int, values: dict[str, float]) -> None:
+        if begin <= i < end:
+            values["t_q_degc"], values["at_degc"] = values["at_degc"], values["t_q_degc"]
+        values["y_um"] = values["y_um"] if has_y else math.nan
+
+    guards = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
+    watched = config(channel=CHANNELS, plausibility=LIMITS, loss={"predict_for_min": 60.0}, guards=guards)
+    outcomes = outcomes_of(day, 600, exchanged, watched)
+    reasons = [set(o.offset.reasons) for o in outcomes]
+    assert first_at(outcomes, "t_q_at_exchanged") < begin + 30
+    assert all("t_q_at_exchanged" in one for one in reasons[begin + 30 : end])
+    assert all("t_q_at_exchanged" in one for one in reasons[end:]) is not has_y
+    if has_y:
+        over = next(i for i in range(end, 600) if "t_q_at_exchanged" not in reasons[i])
+        assert over < end + 120 and not any("t_q_at_exchanged" in one for one in reasons[over:])
+        left_um = [number(o.offset.y_offset_um) + float(day["y_um"][i]) for i, o in enumerate(outcomes)]
+        assert max(map(abs, left_um[over + 20 :])) < 5.0
+
+
 def test_a_couple_that_is_apart_at_rest_is_said(day: dict[str, np.ndarray]) -> None:
     rest = {"channel": "heat_w", "at_most": 1.0, "after_min": 240.0, "t_q_at_max_k": 0.8}
 

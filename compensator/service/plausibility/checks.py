@@ -47,6 +47,9 @@ _CLIP = 3.0
 #: The alarm ends after this number of consecutive blocks within this number of standard deviations.
 QUIET_BLOCKS = 6
 _QUIET = 2.0
+#: Exchanged sensors are right again after this number of consecutive blocks whose residual is within this share of the
+#: prediction, which is this many deviations: exchanged ones predict the contrary, and at rest Y says nothing of them.
+_RIGHT_BLOCKS, _RIGHT_SHARE, _MOVED = 2, 0.2, 10.0
 #: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
 _EXCESS = 1.166
 _DAY_MIN = 1440.0
@@ -136,6 +139,8 @@ class PlausibilityCheck:
     def __init__(self, config: Config, model: ThermalModel) -> None:
         self._limits = config.plausibility or Plausibility()
         self._below_max_k = config.guards.t_q_below_at_max_k
+        # Version 0.1.0 waited for a person: an audit of its recordings comes to the same states.
+        self._ends_exchange = config.guards.suspect_jumps
         self._period_min = model.period_s / 60.0
         self._model_std_um = model.y_std_um
         measured = any(channel.name == "y_um" for channel in config.channel)
@@ -235,7 +240,7 @@ class PlausibilityCheck:
             self.state.exchanged, self.state.apart = old.exchanged, old.apart
 
     def acknowledge(self) -> None:
-        """Clear the latch of exchanged sensors: an operator has checked them."""
+        """Clear the latch of exchanged sensors: an operator, or measured Y, has checked them."""
         self.state.exchanged, self.state.below_min = False, 0.0
 
     def pass_time(self, samples: int) -> None:
@@ -324,6 +329,7 @@ class PlausibilityCheck:
         state.high = max(0.0, state.high + e - self._allowance)
         state.low = max(0.0, state.low - e - self._allowance)
         state.z, state.skipped = z, 0
+        self._end_exchange()
         if state.suspects:
             state.quiet_blocks = state.quiet_blocks + 1 if abs(z) < _QUIET else 0
             if state.quiet_blocks >= QUIET_BLOCKS:
@@ -332,6 +338,16 @@ class PlausibilityCheck:
                 return
         if state.suspects or max(state.high, state.low) > self.threshold:
             self._isolate(block)
+
+    def _end_exchange(self) -> None:
+        """Believe that sensors are no longer exchanged once measured Y agrees with what they say of a warm machine."""
+        state = self.state
+        if not (state.exchanged and self._ends_exchange and state.below_min == 0.0):
+            return
+        last = state.blocks[-_RIGHT_BLOCKS:]
+        if all(abs(b.residual_um) / _RIGHT_SHARE < abs(b.predicted_um) > _MOVED * b.std_um for b in last):
+            self.acknowledge()
+            self._note(Implausibility.TOGETHER, "measured Y agrees with T_Q and AT: they are not exchanged any more")
 
     def _isolate(self, block: ResidualBlock) -> None:
         """Find the likely causes; each further block may improve the result until the onset leaves the window."""
