@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from compensator.arrays import Matrix
+from compensator.arrays import Matrix, Vector
 
 #: P counts as settled when no element moves by more than this, relative to its standard deviations.
 SETTLED = 1e-7
@@ -411,8 +411,41 @@ class Covariance:
         p = _corrected(p, column / s, column, s)
         y_var = _variance(self._of_y, p.tolist())
         if y_var > self.y_var:
-            self._set(_read_only(p), _Expected())
-            self._y_var, self.settled = y_var, False
+            self._replace(p)
+
+    def measure_y(self, variance_um2: float) -> tuple[list[float], float]:
+        """Take a measured y after the sample's other measurements; return its gain and the variance expected of it.
+
+        Parameters
+        ----------
+        variance_um2 : float
+            Variance of the value itself, µm².
+        """
+        p = self.p
+        column = np.zeros(self.size)
+        for state, weight in self._of_y:
+            column = column + weight * p[:, state]
+        s = variance_um2 + sum(weight * float(column[state]) for state, weight in self._of_y)
+        gain = column / s
+        self._replace(_corrected(p, gain, column, s))
+        return gain.tolist(), s
+
+    def doubt(self, changes: Iterable[Sequence[float] | Vector]) -> None:
+        """Widen it by errors of the state that are independent of each other, each of its own size.
+
+        Parameters
+        ----------
+        changes : iterable of sequence of float, shape (n,)
+            One standard deviation of each, as a change of the state.
+        """
+        p = self.p
+        for change in changes:
+            p = p + np.multiply.outer(np.array(change), np.array(change))
+        self._replace(p)
+
+    def _replace(self, p: Matrix) -> None:
+        self._set(_read_only(p), _Expected())
+        self._y_var, self.settled = _variance(self._of_y, p.tolist()), False
 
     def upper_triangle(self) -> tuple[float, ...]:
         """Return the upper triangle, row by row, which is all that there is: it is symmetric to the bit."""

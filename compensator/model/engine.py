@@ -20,13 +20,15 @@ import numpy as np
 from compensator.arrays import NAN, Vector
 from compensator.errors import ModelError
 from compensator.model.effects import EffectStream, Signals
-from compensator.model.late_observer import observer_of
+from compensator.model.late_observer import LateObserver, observer_of
 from compensator.model.observer import Forecast, ObserverState
 from compensator.model.outputs import OutputEstimate
 from compensator.model.thermal_model import ThermalModel
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
 BRIDGE_SAMPLES = 60
+#: Samples within which a covariance is steady.
+_SETTLES_IN = 1500
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,6 +401,34 @@ class Engine:
         """Return the heat, W (T_Q − AT, K, in a direct model), that would explain a difference of T_Q, K, at once."""
         return self._observer.drive_for(t_q_k)
 
+    def measure_y(self, residual_um: float, variance_um2: float) -> float:
+        """Correct the state after a sample by a measured deformation; return the variance expected of the residual.
+
+        Parameters
+        ----------
+        residual_um : float
+            Measured deformation − that of the last estimate, µm.
+        variance_um2 : float
+            Variance of the value itself, µm².
+        """
+        return self._observer.measure_y(residual_um, variance_um2)
+
+    @property
+    def takes_y(self) -> bool:
+        """Whether the state can be corrected by a measured deformation: it is not that of some samples before."""
+        return not isinstance(self._observer, LateObserver)
+
+    def doubt(self, changes: Sequence[Sequence[float] | Vector]) -> None:
+        """Doubt the state by what wrong temperatures may have made of it, and interpolate nothing over this time.
+
+        Parameters
+        ----------
+        changes : sequence of sequence of float
+            One standard deviation of each independent error, as `wrong_histories` gives them.
+        """
+        self._gap = self._last_complete = None
+        self._observer.doubt(changes)
+
     def shift_reference(self, t_q_k: float, at_k: float) -> None:
         """Move the reference without a change of the state: a sensor has another zero from now on, K."""
         reference, (t_q_before, at_before) = self._reference, self._shifted_k
@@ -603,3 +633,28 @@ def _interpolated(value: float, before: float, after: float, part: float) -> tup
     if not math.isnan(value):
         return value, False
     return before + part * (after - before), True
+
+
+def wrong_histories(model: ThermalModel, samples: Sequence[int]) -> tuple[list[Vector], list[Vector]]:
+    """Return what 1 K too much of T_Q, and of AT, leaves in the state, for each of some past times.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The model; without a dead time of T_Q, whose state is that of some samples before.
+    samples : sequence of int
+        The times between these numbers of samples ago, increasing.
+    """
+    found = []
+    for t_q_k, at_k in ((1.0, 0.0), (0.0, 1.0)):
+        observer = observer_of(model)
+        for _ in range(_SETTLES_IN):
+            observer.step(0.0, 0.0)
+            if observer.settled:
+                break
+        states = [np.array(observer.x[:-1])]
+        for _ in range(samples[-1]):
+            observer.step(t_q_k, at_k)
+            states.append(np.array(observer.x[:-1]))
+        found.append([states[after] - states[before] for before, after in itertools.pairwise(samples)])
+    return found[0], found[1]

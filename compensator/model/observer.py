@@ -27,9 +27,10 @@ the same bits on every machine, which is what lets an audit compare bit by bit.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from compensator.arrays import Matrix
+from compensator.arrays import Matrix, Vector
 from compensator.model.covariance import Covariance, Design, Terms
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
@@ -326,6 +327,31 @@ class Observer:
             Covariance before the measurements of the present sample, of an observer that skipped the gap.
         """
         self._covariance.widen(ahead)
+
+    # ------------------------------------------------------------------ a measured deformation
+
+    def measure_y(self, residual_um: float, variance_um2: float) -> float:
+        """Correct the state after a sample by a measured y.
+
+        Parameters
+        ----------
+        residual_um : float
+            Measured − estimated y, µm.
+        variance_um2 : float
+            Variance of the value itself, µm².
+
+        Returns
+        -------
+        float
+            Variance that was expected of the residual, µm².
+        """
+        gain, expected = self._covariance.measure_y(variance_um2)
+        self._correct(gain, residual_um)
+        return expected
+
+    def doubt(self, changes: Sequence[Sequence[float] | Vector]) -> None:
+        """Widen the covariance by errors that the state may have, each one standard deviation of a change of it."""
+        self._covariance.doubt(changes)
 
     # ------------------------------------------------------------------ state
 

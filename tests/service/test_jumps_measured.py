@@ -40,6 +40,56 @@ def test_measured_y_speaks_for_a_mended_channel_though_it_was_wrong_before_it_ju
     assert outcomes[end + 180].offset.state == "ok"
 
 
+def drifts(channel: str, k_per_h: float, begin: int, end: int) -> Change:
+    """A couple that drifts until somebody mends it."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values[channel] += k_per_h * (i - begin) / 60.0 if begin <= i < end else 0.0
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("channel", "k_per_h", "end"), [("t_q_degc", 1.5, 420), ("t_q_degc", -1.0, 480), ("at_degc", 1.2, 400)]
+)
+def test_after_a_drift_is_mended_the_offset_is_right_within_an_hour(
+    day: dict[str, np.ndarray], channel: str, k_per_h: float, end: int
+) -> None:
+    """What it has shown for hours is in the state: measured Y, not time, puts that right."""
+    outcomes = followed(day, drifts(channel, k_per_h, 180, end), residual_std_um=0.3, false_alarm_days=30.0)
+    assert f"suspect_channel:{channel}" in outcomes[end + 1].offset.reasons
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True)))
+    assert np.max(wrong[end : end + 5]) > 5.0 and np.max(wrong[end + 60 :]) < 5.0
+    assert any("measured Y shows that it was wrong" in note.text for o in outcomes for note in o.notes)
+
+
+@pytest.mark.parametrize("size", [4.0, -4.0, 9.0])
+@pytest.mark.parametrize("channel", ["t_q_degc", "at_degc"])
+def test_a_channel_that_is_wrong_from_its_jump_on_was_not_wrong_before(
+    day: dict[str, np.ndarray], channel: str, size: float
+) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        values[channel] += size if i >= 300 else 0.0
+
+    outcomes = followed(day, change, false_alarm_days=30.0)
+    assert all(f"suspect_channel:{channel}" in o.offset.reasons for o in outcomes[301:])
+
+
+def test_what_y_has_shown_since_a_jump_survives_a_restart(day: dict[str, np.ndarray]) -> None:
+    change = drifts("t_q_degc", 1.5, 180, 420)
+    conf = settings({"false_alarm_days": 30.0})
+    whole, parts = Compensation(conf, QUILL), Compensation(conf, QUILL)
+    for i in range(500):
+        values = readings(day, i)
+        change(i, values)
+        if i in (422, 425):
+            again = Compensation(conf, QUILL)
+            again.restore(parts.state())
+            parts = again
+        assert parts.process(sample(i, values)) == whole.process(sample(i, values))
+    assert parts.state() == whole.state() and decode_state(whole.state()).jumps is not None
+
+
 @pytest.mark.parametrize(("begin", "end"), [(300, 360), (400, 450)])
 def test_a_mended_channel_is_used_again_where_y_has_more_noise_than_the_model_errs(
     day: dict[str, np.ndarray], begin: int, end: int

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
+from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.jump_engines import JumpEngines
 from compensator.service.plausibility.jump_state import JumpState
 
@@ -22,25 +22,6 @@ _Y_MISFIT = 3
 _PROBES = 2
 #: So soon after a jump both engines agree, and a probe that fits says nothing.
 _APART_SAMPLES = 10
-
-
-class GrownY(NamedTuple):
-    """Deformation since the zero by measured Y, µm; NaN where it is not known.
-
-    Parameters
-    ----------
-    by_level : float
-        By how Y stood to the prediction before the jump: a model that is wrong by some µm says nothing of the sensor.
-    by_zero : float
-        By Y at the zero: what was wrong before the jump counts, too.
-    level_std_um, zero_std_um : float
-        Their standard deviations, the noise of Y included, µm: at the zero Y was one value.
-    """
-
-    by_level: float
-    by_zero: float
-    level_std_um: float
-    zero_std_um: float
 
 
 def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:

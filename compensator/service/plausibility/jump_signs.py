@@ -85,6 +85,15 @@ def jump_note(name: str, shift_k: float, then: str = "and is not used until its 
     )
 
 
+def mended_note(name: str, size_k: float) -> Note:
+    """Return the event of a channel that was wrong before its jump, by measured Y."""
+    return Note(
+        EventKind.PLAUSIBILITY,
+        f"{NAMES[name]} is used again: measured Y shows that it was wrong before its jump of {size_k:+.2f} K",
+        {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": size_k},
+    )
+
+
 def unconfirmed_note(name: str, shift_k: float, when: str) -> Note:
     """Return the event that a channel may have jumped, and that nobody saw whether it has."""
     return Note(

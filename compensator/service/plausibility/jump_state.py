@@ -11,6 +11,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.messages import Count, Number
 from compensator.model.engine import EngineState, Estimate
+from compensator.service.plausibility.hindsight import HindsightState
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
@@ -122,6 +123,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         What the compensation's engine had estimated at a zero on a warm machine since then.
     beside : JumpState, optional
         State of the watch of the other channel, while one is suspect.
+    hindsight : HindsightState, optional
+        Whether suspect channels were wrong before their jump; of the watch as a whole.
     """
 
     level_um: float = NAN
@@ -153,6 +156,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     learned_um: Number = 0.0
     zero_in_use: Estimate | None = None
     beside: JumpState | None = None
+    hindsight: HindsightState | None = None
 
     @property
     def is_suspect(self) -> bool:
@@ -246,7 +250,8 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def without_engines(self) -> JumpState:
         """Return a copy without the states of the engines and of the watch beside."""
-        return copy.deepcopy(msgspec.structs.replace(self, believing=None, shifted=None, zero_in_use=None, beside=None))
+        engines = dict.fromkeys(("believing", "shifted", "zero_in_use", "beside", "hindsight"))
+        return copy.deepcopy(msgspec.structs.replace(self, **engines))
 
     def branches(self) -> list[Branch]:
         """Return the states of all engines, those of the watch beside included."""

@@ -16,11 +16,12 @@ from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.config import Config
 from compensator.messages import ChannelSample, number
-from compensator.model.engine import Engine, Estimate
+from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
+from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.guards import TEMPERATURES
-from compensator.service.plausibility.jump_evidence import GrownY
-from compensator.service.plausibility.jump_signs import JumpSigns
+from compensator.service.plausibility.hindsight import Hindsight
+from compensator.service.plausibility.jump_signs import JumpSigns, mended_note
 from compensator.service.plausibility.jump_state import JumpState
 from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
 
@@ -51,6 +52,7 @@ class JumpWatch:
             y_std_um=stated or model.y_std_um,
         )
         self._jump = OneJump(self._setup)
+        self._hindsight = Hindsight(model)
         self._level_um = self._zero_um = NAN
         self._noise_um2, self._last_um = 0.0, NAN
         self._learned_um = 0.0
@@ -96,6 +98,7 @@ class JumpWatch:
             noise_um2=self._noise_um2,
             last_um=self._last_um,
             learned_um=self._learned_um,
+            hindsight=self._hindsight.state,
         )
 
     def restore(self, state: JumpState | None) -> None:
@@ -107,7 +110,9 @@ class JumpWatch:
             If it does not belong to the model, or is incomplete; nothing is changed then.
         """
         state = state or JumpState()
-        self._jump = OneJump.restored(self._setup, state)
+        jump = OneJump.restored(self._setup, state)
+        self._hindsight.restore(state.hindsight)
+        self._jump = jump
         self._level_um, self._zero_um = state.level_um, state.zero_um
         self._noise_um2, self._last_um = max(state.noise_um2, 0.0), state.last_um
         self._learned_um, self._estimate = state.learned_um, None
@@ -127,10 +132,12 @@ class JumpWatch:
         self._jump.set_zero(used)
         self._level_um = self._zero_um = y_um if self._jump.is_open else NAN
         self._learned_um = 0.0
+        self._hindsight.end()
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._jump.pass_time(samples, held=held)
+        self._hindsight.end()
 
     def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
@@ -182,9 +189,37 @@ class JumpWatch:
             level_std_um=self._std_um(),
             zero_std_um=self._std_um(at_zero=True),
         )
+        then = engine.snapshot() if self._jump.is_open else None
         found = self._jump.judge(engine, measured, fast, others, grown)
+        found = self._in_hindsight(engine, then, found, measured, others, grown)
         self._forget(*before)
         return found
+
+    def _in_hindsight(
+        self,
+        engine: Engine,
+        then: EngineState | None,
+        found: Judgement,
+        measured: Mapping[str, float],
+        others: Mapping[str, float],
+        grown: GrownY,
+    ) -> Judgement:
+        """Use suspect channels again if measured Y shows that they were wrong before their jump and are right now."""
+        suspects = self._jump.suspects
+        # What was believed at a zero since the jump is not known here, and a loose contact may be right for a while.
+        if not suspects or self._jump.is_loose or self._jump.zero_in_use is not None:
+            self._hindsight.end()
+            return found
+        jumps_k = {name: size for name, size in self._jump.sizes_k().items() if name in suspects}
+        mended = self._hindsight.judge(then or engine.snapshot(), jumps_k, measured, others, grown)
+        if mended is None:
+            return found
+        state, estimate = mended
+        engine.restore(state)
+        self._jump.end()
+        self._hindsight.end()
+        notes = [mended_note(name, jumps_k[name]) for name in suspects]
+        return Judgement(estimate, [*found.notes, *notes], {name: measured[name] for name in suspects}, found.zeros)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float, learned_um: float) -> None:
         """Compare both engines with a probe.

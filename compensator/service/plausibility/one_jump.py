@@ -12,6 +12,7 @@ from compensator.arrays import NAN
 from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
+from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.jump_engines import (
     UNSEEN_SAMPLES,
@@ -24,7 +25,7 @@ from compensator.service.plausibility.jump_engines import (
     shifts_against,
     stds,
 )
-from compensator.service.plausibility.jump_evidence import GrownY, is_contradicted, weigh_probe, weigh_y
+from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
 from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import JumpState, Phase
 from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
@@ -117,6 +118,16 @@ class OneJump:
         """Channels that are used, and of which nothing confirms that they have kept their zero."""
         own = tuple(self.state.jumps) if self.state.is_unconfirmed else ()
         return own + (self._beside.unconfirmed if self._beside is not None else ())
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether a channel in question has jumped again and again."""
+        return is_unsteady(self.state) or (self._beside is not None and self._beside.is_loose)
+
+    def sizes_k(self) -> dict[str, float]:
+        """Return the jumps of all channels in question, K."""
+        beside = self._beside.sizes_k() if self._beside is not None else {}
+        return {name: jump.size_k for name, jump in self.state.jumps.items()} | beside
 
     def doubts(self, used: Estimate | None) -> list[float]:
         """Return the standard deviation of Y and of each further output by both answers; empty where there is one.
