@@ -278,6 +278,12 @@ def test_a_time_of_too_many_digits_is_refused_in_one_line(tmp_path: Path, digits
     assert "[row_broken]" in bench.reports[0] and len(bench.reports[0]) < 500 and "\n" not in bench.reports[0]
 
 
+def test_the_name_of_a_file_writes_no_line_of_its_own(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.write("none", "a\n\x1b[2Jb.csv")
+    assert len(bench.reports) == 1 and bench.reports[0].isprintable() and r"a\n\x1b[2Jb.csv" in bench.reports[0]
+
+
 def test_a_mistyped_year_is_refused_once_and_ends_nothing(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.write(HEADER + line(0).replace("2026", "3026") + line(1))
