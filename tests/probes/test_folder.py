@@ -291,7 +291,7 @@ def test_a_mistyped_year_is_refused_once_and_ends_nothing(tmp_path: Path) -> Non
     bench.look()
     assert bench.minutes == [1] and "[row_broken]" in bench.reports[0]
     assert bench.reports == bench.reports[:1] * 2  # once each start
-    assert [key.partition(" ")[0] for key in json.loads(bench.state.read_text())["handled"]] == [str(T0_NS + 60 * 10**9)]
+    assert list(json.loads(bench.state.read_text())["handled"]) == [f"{T0_NS + 60 * 10**9} sphere-1"]
 
 
 def test_no_line_makes_the_state_unreadable(tmp_path: Path) -> None:
