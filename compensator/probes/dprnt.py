@@ -20,6 +20,7 @@ from __future__ import annotations
 import datetime
 import re
 from dataclasses import dataclass
+from decimal import Decimal
 
 from compensator.probes.probe import LARGEST_UM
 
@@ -149,12 +150,18 @@ def _seconds(words: dict[str, str], word: str, longest_s: float) -> float | None
 
 
 def _name(words: dict[str, str], word: str) -> str:
-    """Return a name; a number, which controls print in many forms (`1.`, `01`, `1.000`), as a plain one."""
+    """Return a name; a number, which controls print in many forms (`1.`, `01`, `1.000`), as a plain one, exactly.
+
+    Two features with the same name would share a zero.
+    """
     if word not in words:
         return ""
     text = words[word]
-    if _NUMBER.fullmatch(text):
-        return f"{_number(word, text):g}"
+    number = _NUMBER.fullmatch(text)
+    if number is not None:
+        exact = Decimal("".join(number.groups()))
+        # Below this a number has so few digits that none is lost.
+        return f"{float(exact):g}" if abs(exact) < Decimal("1e-4") else f"{exact.normalize():f}"
     if not _NAME.fullmatch(text):
         raise Unusable(f"{word} = {text!r}, expected a number or a name")
     return text

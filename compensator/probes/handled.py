@@ -67,10 +67,18 @@ class Handled:
         if not self._changed:
             return
         oldest = now_utc_ns - self._keep_ns
-        self._lines = {key: value for key, value in self._lines.items() if _time_utc_ns(key) >= oldest}
+        self._lines = {key: value for key, value in self._lines.items() if _is_kept(key, oldest)}
         with atomic_write(self._path) as file:
             json.dump({"handled": self._lines}, file)
         self._changed = False
+
+
+def _is_kept(identity: str, oldest_ns: int) -> bool:
+    """Return whether a line is kept; one that could not be read again would end the next start."""
+    try:
+        return _time_utc_ns(identity) >= oldest_ns
+    except ValueError:
+        return False
 
 
 def _time_utc_ns(identity: str) -> int:

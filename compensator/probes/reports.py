@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from compensator.codes import ProbeSourceRemark, Remark
+from compensator.errors import one_line
 
 #: Called with each line for the log.
 Report = Callable[[str], None]
@@ -30,9 +31,9 @@ def not_sent(code: ProbeSourceRemark, source: str | Path, line: str | None, why:
         How many there were.
     """
     shown = f"{line[:SHOWN]!r}: " if line is not None else ""
-    return Remark(code, f"{source}: not sent{count}: {shown}{why}.").marked
+    return Remark(code, one_line(f"{source}: not sent{count}: {shown}{why}.")).marked
 
 
 def lost(source: str | Path, why: object) -> str:
     """Return the report on a source that is lost."""
-    return Remark(ProbeSourceRemark.SOURCE_LOST, f"{source}: {why}.").marked
+    return Remark(ProbeSourceRemark.SOURCE_LOST, one_line(f"{source}: {why}.")).marked

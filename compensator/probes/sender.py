@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from compensator.clock import duration
 from compensator.codes import ProbeCode, ProbeSourceRemark, Remark
+from compensator.errors import one_line
 from compensator.probes.probe import NotSent, Probe, ProbeSink
 from compensator.probes.reports import Report
 
@@ -58,7 +59,8 @@ class Sender:
         self._sink = sink
         self.send_within_s = send_within_s
         self._retry_s = retry_s
-        self._report = report
+        # The service's reply and the name of a file are a stranger's words.
+        self._report: Report = lambda text: report(one_line(text))
         self._utc_ns = utc_ns
         self._waiting: deque[_Waiting] = deque()
         self._changed = asyncio.Event()

@@ -22,6 +22,8 @@ COLUMNS = {
     "tool": False,
     "stopped_s": False,
 }
+#: Times are below this, ns since 1970 UTC, whatever their form; in the year 2262.
+_END_NS = 2**63
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 
 
@@ -155,7 +157,7 @@ def _time(values: Mapping[str, str]) -> int:
     if "time_utc_ns" in values:
         text = values["time_utc_ns"]
         # The length is checked first: Python refuses to convert thousands of digits.
-        if not (text.isascii() and text.isdigit() and len(text) <= 19 and 0 < int(text) < 2**63):
+        if not (text.isascii() and text.isdigit() and len(text) <= 19 and 0 < int(text) < _END_NS):
             raise BadLine(f"time_utc_ns = {text[:40]!r}, expected ns since 1970 UTC")
         return int(text)
     try:
@@ -164,6 +166,7 @@ def _time(values: Mapping[str, str]) -> int:
         raise BadLine(f"time_utc = {values['time_utc'][:40]!r}, expected such as 2026-03-02T10:00:00Z") from None
     if time.tzinfo is None:
         raise BadLine(f"time_utc = {values['time_utc'][:40]!r} has no zone, expected Z at its end")
-    if time < _EPOCH:
-        raise BadLine(f"time_utc = {values['time_utc'][:40]!r}, expected a time after 1970")
-    return (time - _EPOCH) // datetime.timedelta(microseconds=1) * 1000
+    time_utc_ns = (time - _EPOCH) // datetime.timedelta(microseconds=1) * 1000
+    if not 0 < time_utc_ns < _END_NS:
+        raise BadLine(f"time_utc = {values['time_utc'][:40]!r}, expected a time after 1970, at most 2262-04-11")
+    return time_utc_ns

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import time
+from contextlib import suppress
 
 from .axes_receiver import AxesReceiver
 from .axes_settings import AxesSettings, load_any
@@ -44,8 +46,14 @@ def main() -> int:
             shown = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
             if shown != reported:
                 reported = shown
-                sys.stdout.write(applied.text + "\n")
-                sys.stdout.flush()
+                try:
+                    sys.stdout.write(applied.text + "\n")
+                    sys.stdout.flush()
+                except OSError as error:  # nobody reads it, and no control depends on it
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python would try to print it again at the end
+                    with suppress(OSError):
+                        sys.stderr.write(f"compensator.receiver: standard output: {error.strerror or error}\n")
+                    return 1
     return 0
 
 

@@ -76,8 +76,7 @@ def applied_at(path: Path, time_utc_ns: int) -> float | None:
     time_utc_ns : int
         Time, ns since 1970 UTC.
     """
-    values = [*_values(path.with_name(path.name + ".1")), *_values(path)]
-    values.sort(key=lambda value: value[0])  # stable: after a step of the clock the later line of a time counts
+    values = _of_last_clock([*_values(path.with_name(path.name + ".1")), *_values(path)])
     after = bisect.bisect_right(values, time_utc_ns, key=lambda value: value[0])
     if after == 0:
         return None
@@ -90,6 +89,22 @@ def applied_at(path: Path, time_utc_ns: int) -> float | None:
     to_ns, to_um = values[after]
     assert to_um is not None
     return from_um + (to_um - from_um) * (time_utc_ns - from_ns) / max(to_ns - from_ns, 1)
+
+
+def _of_last_clock(lines: list[tuple[int, float | None]]) -> list[tuple[int, float | None]]:
+    """Return the values in the order of their times: what was written before the clock was set back is replaced.
+
+    Mixed, two values that follow each other might be of two clocks, and what is between them was never applied.
+    """
+    values: list[tuple[int, float | None]] = []
+    for line in lines:
+        if values and line[0] < values[-1][0]:
+            while values and line[0] <= values[-1][0]:
+                values.pop()
+            if values:
+                values.append((values[-1][0], None))  # from here to the line the offset is not known
+        values.append(line)
+    return values
 
 
 def _values(path: Path) -> list[tuple[int, float | None]]:

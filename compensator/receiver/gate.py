@@ -154,7 +154,8 @@ class Gate(Generic[M]):
             self._check_value(message, age_s)
         except Rejected as rejected:
             raise Rejected(Reason("replayed", detail)) from rejected
-        if not self._restart.is_shown_by(now_s, message, self._valid_s(message)):
+        # Its own validity: `valid_max_s` says nothing of how far apart a service's messages are.
+        if not self._restart.is_shown_by(now_s, message, message.valid_for_s):
             raise Rejected(Reason("replayed", detail))
 
     def _check_value(self, message: M, age_s: float | None) -> None:

@@ -42,7 +42,7 @@ class CountRestart:
         """Forget the messages so far."""
         self._last, self._count = None, 0
 
-    def is_shown_by(self, now_s: float, message: Numbered, valid_s: float) -> bool:
+    def is_shown_by(self, now_s: float, message: Numbered, valid_for_s: float) -> bool:
         """Return whether the count restarts with this message.
 
         Parameters
@@ -51,15 +51,15 @@ class CountRestart:
             Arrival by the monotonic clock, s.
         message : Numbered
             A message that is usable but for its number.
-        valid_s : float
-            Time for which it may be used, s.
+        valid_for_s : float
+            Validity that it was published with, s: two to three samples.
         """
         last = self._last
         if last is not None and message.seq > last.seq and message.time_utc_ns > last.time_utc_ns:
             arrived_s, measured_s = now_s - self._received_s, (message.time_utc_ns - last.time_utc_ns) / 1e9
-            if arrived_s < SHORTEST_PART * valid_s:
+            if arrived_s < SHORTEST_PART * valid_for_s:
                 return False  # a burst says nothing, and must not hide those that count
-            in_row = arrived_s <= valid_s and abs(arrived_s - measured_s) <= DIFFERENCE_PART * valid_s
+            in_row = arrived_s <= valid_for_s and abs(arrived_s - measured_s) <= DIFFERENCE_PART * valid_for_s
             self._count = self._count + 1 if in_row else 1
         else:
             self._count = 1

@@ -10,6 +10,7 @@ A separate small program, because LinuxCNC's `hal` module is under the GPL. Pins
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
 import time
@@ -206,9 +207,12 @@ def _show_probe(component: Any, machine: Machine) -> None:
 
 
 def report(text: str) -> None:
-    """Write a line to LinuxCNC's terminal."""
-    sys.stderr.write(f"thermal-offset: {text}\n")
-    sys.stderr.flush()
+    """Write a line to LinuxCNC's terminal, if it can be written: nothing here may end the loop that moves the axes."""
+    if sys.stderr is None:  # closed before the start
+        return
+    with contextlib.suppress(OSError):  # a terminal that was closed, a pipe without a reader, a full disk
+        sys.stderr.write(f"thermal-offset: {text}\n")
+        sys.stderr.flush()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The smallest program that brings the offset to a control: `follow.py receiver.toml`."""
 
+import os
 import signal
 import sys
 import time
@@ -25,5 +26,8 @@ try:
             time.sleep(0.5)
 except ReceiverError as error:
     sys.exit(f"follow.py: {error}")
+except OSError as error:  # nobody reads what it prints; the applied offset stays
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python would try to print it again at the end
+    sys.exit(f"follow.py: {error.strerror or error}")
 except KeyboardInterrupt:
     pass  # the applied offset stays

@@ -1,5 +1,6 @@
 """The smallest program that brings several axes to a control: `follow_axes.py receiver_axes.toml`."""
 
+import os
 import signal
 import sys
 import time
@@ -32,5 +33,8 @@ try:
             time.sleep(0.5)
 except ReceiverError as error:
     sys.exit(f"follow_axes.py: {error}")
+except OSError as error:  # nobody reads what it prints; the applied offsets stay
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python would try to print it again at the end
+    sys.exit(f"follow_axes.py: {error.strerror or error}")
 except KeyboardInterrupt:
     pass  # the applied offsets stay

@@ -60,6 +60,19 @@ def test_what_the_line_does_not_say_is_not_made_up() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        *[("1.", "1"), ("001", "1"), ("1.500", "1.5"), ("- 3", "-3"), ("0.", "0"), ("-0", "-0"), (".00001", "1e-05")],
+        *[("999999", "999999"), ("1000000.", "1000000"), ("1234567", "1234567"), ("1234568", "1234568")],
+        *[("123456789.123456789", "123456789.123456789"), ("1.0000001", "1.0000001"), (".000123456", "0.000123456")],
+    ],
+)
+def test_no_two_numbers_are_one_name(text: str, name: str) -> None:
+    found = parse(GOOD.replace("F 1", f"F{text} T{text}"))
+    assert found is not None and (found.feature, found.tool) == (name, name)
+
+
 def test_a_year_of_two_digits() -> None:
     found = parse(GOOD.replace(" END", " D 260302 H5 END"))
     assert found is not None and found.printed_at == datetime.datetime(2026, 3, 2, 0, 0, 5)

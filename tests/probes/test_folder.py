@@ -252,6 +252,7 @@ GOOD = "2026-03-02T10:00:00Z,y,3.2,-12.3,1.5,sphere-1,probe,20"
         ("2026", "1926", "after 1970"),
         ("2026-03-02T10:00:00Z", "0001-01-01T00:00:00+23:59", "after 1970"),
         ("2026-03-02T10:00:00Z", "", "time_utc"),
+        ("2026-03-02T10:00:00Z", "2262-04-11T23:47:16.854776Z", "at most 2262"),
     ],
 )
 def test_a_value_that_cannot_be_used(old: str, new: str, why: str) -> None:
@@ -275,6 +276,32 @@ def test_a_time_of_too_many_digits_is_refused_in_one_line(tmp_path: Path, digits
     bench.write(f"time_utc_ns,measured_um,offset_applied_um,feature\n{digits},1,0,a\n{T0_NS},1,0,a\n")
     assert bench.minutes == [0] and len(bench.reports) == 1
     assert "[row_broken]" in bench.reports[0] and len(bench.reports[0]) < 500 and "\n" not in bench.reports[0]
+
+
+def test_the_name_of_a_file_writes_no_line_of_its_own(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.write("none", "a\n\x1b[2Jb.csv")
+    assert len(bench.reports) == 1 and bench.reports[0].isprintable() and r"a\n\x1b[2Jb.csv" in bench.reports[0]
+
+
+def test_a_mistyped_year_is_refused_once_and_ends_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.write(HEADER + line(0).replace("2026", "3026") + line(1))
+    bench.restart()
+    bench.look()
+    assert bench.minutes == [1] and "[row_broken]" in bench.reports[0]
+    assert bench.reports == bench.reports[:1] * 2  # once each start
+    assert list(json.loads(bench.state.read_text())["handled"]) == [f"{T0_NS + 60 * 10**9} sphere-1"]
+
+
+def test_no_line_makes_the_state_unreadable(tmp_path: Path) -> None:
+    handled = Handled(tmp_path / "state.json", 900.0)
+    good = row(NAMES, GOOD)
+    handled.add(good)
+    handled.add(good._replace(time_utc_ns=10**19))
+    handled.write(T0_NS)
+    again = Handled(tmp_path / "state.json", 900.0)
+    assert again.values(good.identity) == good.values
 
 
 def test_a_long_file_is_read_as_there_is_room_and_the_state_written_once_a_look(

@@ -58,6 +58,15 @@ async def test_in_order_with_the_answers(bench: Bench) -> None:
     assert "[duplicate]" in bench.reports[2] and bench.sent_s == [1000, 999]
 
 
+@pytest.mark.parametrize("code", ["probe_future", "probe_too_many"])
+async def test_a_reply_writes_no_line_of_its_own(bench: Bench, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    reply = Reply(False, "no\n\x1b[2Jsource: sent: +1.00 µm", code)
+    monkeypatch.setattr(bench.sink, "send", lambda _: reply)
+    bench.submit(1000)
+    await until(lambda: bench.reports, "a report")
+    assert bench.reports[0].isprintable() and r"no\n\x1b[2Jsource" in bench.reports[0] and "µm" in bench.reports[0]
+
+
 async def test_what_could_not_be_sent_is_sent_later_as_it_was(bench: Bench) -> None:
     bench.sink.reachable = False
     bench.submit(1000)

@@ -85,6 +85,16 @@ def test_a_clock_set_back(tmp_path: Path) -> None:
     assert at(path, 51) == 7.0
 
 
+def test_after_a_clock_set_back_no_value_is_mixed_of_two_clocks(tmp_path: Path) -> None:
+    path = tmp_path / "applied.txt"
+    record = recorded(path, [(second, 0.0) for second in range(100, 140, 2)])
+    for at_s in (121, 123, 125):
+        record.append(at_s * S, 50.0)
+    assert [at(path, tenth / 10) for tenth in range(1210, 1251)] == [50.0] * 41
+    assert at(path, 120.5) is None  # 0 by the one clock, unknown by the other
+    assert at(path, 119) == 0.0 and at(path, 135) is None
+
+
 def test_a_pipe_in_the_place_of_the_file_never_blocks_the_loop_of_the_control(tmp_path: Path) -> None:
     os.mkfifo(path := tmp_path / "applied.txt")
     caller = threading.Thread(target=lambda: refused.append(tries(path)), daemon=True)

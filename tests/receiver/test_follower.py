@@ -340,6 +340,13 @@ def test_a_service_that_counts_from_a_lower_number_is_followed_after_three_of_it
     assert f.receive(t + 180.0, offset(6, 9.0)) and "count_restarted" not in codes(f.advance(t + 180.0))
 
 
+def test_the_count_restarts_also_where_a_message_is_used_for_less_than_a_sample() -> None:
+    f = Follower(MACHINE, Limits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE, valid_max_s=20.0))
+    assert f.receive(0.0, offset(90_000_000_000, 3.0, time_utc_ns=T0_NS))
+    assert [f.receive(60.0 * i, offset(i, 9.0)) for i in range(1, 4)] == [False, False, True]
+    assert not any(f.receive(300.0 + i, offset(1 + i, 9.0)) for i in range(2))  # a burst still says nothing
+
+
 def test_no_lower_number_counts_while_the_newest_message_is_valid() -> None:
     f, t = settled(3.0)
     f.receive(t, offset(90, 3.0, valid_for_s=600.0))

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -22,3 +26,25 @@ def test_what_the_page_makes_passes_its_tests(name: str, tmp_path: Path, monkeyp
     made: dict[str, Any] = {"__name__": "test_acme_control"}
     exec(compile(BLOCKS[TESTS], f"{PAGE}: {TESTS}", "exec"), made)
     made[name]()
+
+
+def test_a_terminal_that_is_gone_does_not_end_its_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    says = iter(["one", "two"])
+
+    def step(*_: Any) -> str:
+        said = next(says, "")
+        if not said:
+            raise KeyboardInterrupt
+        return said
+
+    def gone(*_: Any, **__: Any) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "argv", ["acme_control.py", "receiver.toml", "127.0.0.1", "1"])
+    made: dict[str, Any] = {"__name__": "acme_control"}
+    exec(compile(BLOCKS[ADAPTER], f"{PAGE}: {ADAPTER}", "exec"), made)
+    made |= {"step": step, "print": gone, "socket": MagicMock(), "time": MagicMock(), "load_settings": lambda _: (0, 0)}
+    made |= {"AcmeControl": lambda _: SimpleNamespace(applied_um=0.0), "Receiver": lambda *_, **__: nullcontext()}
+    with pytest.raises(KeyboardInterrupt):
+        made["main"]()
+    assert next(says, None) is None

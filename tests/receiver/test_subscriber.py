@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -200,6 +201,27 @@ offset_rate_max_um_per_min = 6000.0
         check=False,
     )
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "none.toml" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("program", "settings_of"),
+    [
+        (["-m", "compensator.receiver", "--config"], "receiver"),
+        ([str(ROOT / "deploy/receiver/follow.py")], "receiver"),
+        ([str(ROOT / "deploy/receiver/follow_axes.py")], "receiver_axes"),
+    ],
+)
+def test_a_program_that_nobody_reads_ends_in_one_line(program: list[str], settings_of: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    path = ROOT / f"deploy/receiver/{settings_of}.example.toml"
+    try:
+        done = subprocess.run(
+            [sys.executable, *program, str(path)], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+    finally:
+        os.close(write)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "Broken pipe" in done.stderr
 
 
 def test_the_shipped_settings_follow_the_machine_to_try_things_on() -> None:
