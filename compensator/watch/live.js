@@ -28,12 +28,14 @@ const stamp = (t_s) => `${day(t_s)} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
 const wordLink = (code) => make("a", {href: `#word=${$(`word=${code}`) ? code : code.split(":")[0]}`}, code);
+// A typed address may have a percent sign that encodes nothing.
+const unescaped = (text) => { try { return decodeURIComponent(text); } catch { return text; } };
 const alive = (machine) => ({true: "alive", false: "gone", null: "unknown"})[String(machine.alive)];
 
 // ---------------------------------------------------------------- requests
 
 function selected(machines) {
-  if (location.hash.startsWith("#m=")) current = decodeURIComponent(location.hash.slice(3));
+  if (location.hash.startsWith("#m=")) current = unescaped(location.hash.slice(3));
   else if (!location.hash.startsWith("#word=")) current = null;
   return current ?? (machines.length === 1 ? machines[0].prefix : null);
 }
@@ -259,7 +261,7 @@ function points(history) {
 function openCodes() {
   if (!location.hash.startsWith("#word=")) return;
   $("words").open = true;
-  const target = $(decodeURIComponent(location.hash.slice(1)));
+  const target = $(unescaped(location.hash.slice(1)));
   if (target) target.scrollIntoView();
 }
 addEventListener("hashchange", () => { openCodes(); update(); });

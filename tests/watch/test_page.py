@@ -232,6 +232,13 @@ def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServ
     assert re.search(r"<td>⚠ degraded</td><td>\d+ min</td><td>t_q_missing</td>", text)
 
 
+@pytest.mark.parametrize("part", ["word=%zz", "m=%zz"])
+def test_an_address_with_a_stray_percent_sign_is_drawn(server: PageServer, tmp_path: Path, part: str) -> None:
+    text, console = drawn(f"{server.address}#{part}", tmp_path, 400)
+    said = "2 machines: 2 ok" if part.startswith("word") else "No messages from %zz."
+    assert console == "" and said in text
+
+
 def test_a_browser_draws_the_shop(server: PageServer, tmp_path: Path) -> None:
     text, console = drawn(server.address, tmp_path, 400)
     assert console == "" and "2 machines: 2 ok" in text and text.count('data-prefix="shop/vmc-0') == 2
