@@ -2,7 +2,7 @@
 const POLL_MS = 2000, MOST_ACTIONS = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
 const $ = (id) => document.getElementById(id);
-let past = {prefix: null, history: null}, drawn = "", lastAnswer = null, effects = [], current = null;
+let past = {prefix: null, history: null, now_s: Infinity}, drawn = "", lastAnswer = null, effects = [], current = null;
 
 const make = (tag, attributes = {}, ...children) => {
   const svg = ["svg", "path", "line", "text", "rect", "g"].includes(tag);
@@ -120,14 +120,16 @@ function fillRow(row, machine) {
 // ---------------------------------------------------------------- one machine
 
 async function showOne(prefix, count) {
-  if (past.prefix !== prefix) { past = {prefix, history: null}; drawn = ""; shown = null; }
+  if (past.prefix !== prefix) { past = {prefix, history: null, now_s: Infinity}; drawn = ""; shown = null; }
   const times = past.history ? past.history.t_s : [];
-  // The newest points are requested again: their values come in several messages.
-  const since = times.length ? Math.max(times[times.length - 1] - 300, 0) : 0;
+  // The newest points are requested again: their values come in several messages. A point ahead of the watch's clock,
+  // which may have been set back, keeps no later one out.
+  const since = times.length ? Math.max(Math.min(times[times.length - 1], past.now_s) - 300, 0) : 0;
   const found = await ask(`machine.json?prefix=${encodeURIComponent(prefix)}&since_s=${since}`);
   const machine = found.machine;
   effects = found.effects;
   past.history = joined(past.history, found.history, found.now_s);
+  past.now_s = found.now_s;
   $("shop").hidden = true; $("machine").hidden = false; $("all").hidden = count < 2;
   setText($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
   document.title = `${SIGNS[machine.tone]} ${machine.machine} ${machine.shown}`;

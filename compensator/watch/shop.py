@@ -56,7 +56,7 @@ class Shop:
             if machine is None or kind is None:
                 self.ignored += 1
             else:
-                machine.update(kind, payload, self._clock.monotonic_ns() / NS, asked=asked)
+                machine.update(kind, payload, self._clock.utc_ns(), self._clock.monotonic_ns() / NS, asked=asked)
 
     def set_alive(self, key: str, alive: bool) -> None:
         """Receive a change of a liveliness token, from any thread."""
@@ -78,7 +78,7 @@ class Shop:
             machine = self._machine(prefix)
             if machine is not None:
                 for message in messages:
-                    machine.add_recorded(message)
+                    machine.add_recorded(message, self._clock.utc_ns(), self._clock.monotonic_ns() / NS)
 
     def _machine(self, prefix: str) -> WatchedMachine | None:
         machine = self._machines.get(prefix)
