@@ -10,7 +10,8 @@ from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, WatchedMachine
 from compensator.watch.words import CONFIG, TONES
 
-#: Largest number of machines; messages of further machines are only counted.
+#: Largest number of machines, also for Foxglove and for the losses of a recording; messages of further machines are
+#: only counted here.
 MACHINES = 1000
 _ORDER = {"bad": 0, "warn": 1, "good": 2}
 
