@@ -50,6 +50,8 @@ KINDS = {
 LONGEST = 2**20
 #: Events kept of each machine.
 EVENTS = 50
+#: Longest text of an event that is shown whole, characters; those of services are a few lines at most.
+TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
@@ -461,10 +463,15 @@ class WatchedMachine:
     def _event(self, event: Event) -> dict[str, Any]:
         return {
             "time_utc_ns": event.time_utc_ns,
-            "kind": event.kind,
-            "text": event.text,
-            "do": to_do(event, self.config),
+            "kind": _shortened(event.kind),
+            "text": _shortened(event.text),
+            "do": _shortened(to_do(event, self.config)),
         }
+
+
+def _shortened(text: str) -> str:
+    """Cut a text that no service writes: the page asks for all events every two seconds."""
+    return text if len(text) <= TEXT else f"{text[:TEXT]}…"
 
 
 def _tone(shown: str, warnings: list[Remark]) -> Tone:

@@ -264,6 +264,15 @@ def test_events_say_what_to_do(heard: Heard) -> None:
     assert "resume" in newest["do"] and back["do"] == "" and "probe" in gone["do"]
 
 
+def test_a_text_that_no_service_writes_is_cut(heard: Heard) -> None:
+    heard.hear(event=event(5, text="x" * 2000))
+    heard.hear(event=event(6, kind="diagnosis", text="x" * 300_000, needs="y" * 300_000))
+    heard.hear(event=event(7, kind="z" * 300_000))
+    long_kind, long, whole = heard.machine["events"]
+    assert (long["text"], long["do"], long_kind["kind"]) == ("x" * 2000 + "…", "y" * 2000 + "…", "z" * 2000 + "…")
+    assert whole["text"] == "x" * 2000
+
+
 @pytest.mark.parametrize(
     ("kind", "data", "expected"),
     [
