@@ -17,6 +17,7 @@ from compensator.errors import ServiceError
 from compensator.messages import shipped_schema
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.origin_gate import VIEWERS, OriginGate
+from compensator.watch.shop import MACHINES
 
 #: The only address to which the server is bound.
 HOST = "127.0.0.1"
@@ -68,6 +69,8 @@ class FoxgloveServer:
         self._origins = (*VIEWERS, *origins)
         self._context: Any = foxglove.Context()
         self._lock = threading.Lock()
+        #: Prefixes of the machines that have channels, at most `MACHINES`.
+        self._machines: set[str] = set()
         self._channels: dict[str, Any] = {}
         #: Messages for a new viewer, by topic: the latest message, the last events.
         self._latest: dict[str, list[tuple[bytes, int]]] = {}
@@ -103,7 +106,7 @@ class FoxgloveServer:
         self._stack.close()
 
     def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Forward a message with its own time; malformed messages are dropped."""
+        """Forward a message with its own time; malformed messages and those of further machines are dropped."""
         found = topic_of(key, self._prefix)
         if found is None:
             return
@@ -112,7 +115,11 @@ class FoxgloveServer:
             message = decoded(kind, payload)
         except Malformed:
             return
+        machine = key.rpartition("/thermal/")[0]
         with self._lock:
+            if machine not in self._machines and len(self._machines) >= MACHINES:
+                return
+            self._machines.add(machine)
             kept = self._latest.setdefault(topic, [])
             if asked and kept:
                 return

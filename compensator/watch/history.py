@@ -15,6 +15,9 @@ from compensator.messages import Candidate, EstimateMessage, Offset, Sample, Sta
 #: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
 STEP_NS = 60 * NS
+#: A point farther ahead of the watch's clock than this is dropped, ns: clocks differ by seconds or minutes, and points
+#: ahead would never be older than a day.
+AHEAD_NS = 300 * NS
 #: Shortest pause that separates two intervals in the same state, s.
 LEAST_PAUSE_S = 150.0
 #: Values of a point from the estimate and from the offset.
@@ -47,18 +50,32 @@ class MachineHistory:
     """Points of the last day; messages may arrive in any order.
 
     The newest sample of a minute is its point. The values of one sample come in several messages with the same number.
-    A value that did not arrive is None.
+    A value that did not arrive is None. No point is older than a day or farther ahead than `AHEAD_NS`, so their number
+    is limited.
     """
 
     def __init__(self) -> None:
         self._points: dict[int, dict[str, Any]] = {}
+        #: Minute of the last `prune`: within one no point becomes too old.
+        self._pruned = -1
 
     def __len__(self) -> int:
         return len(self._points)
 
-    def add(self, message: Sample | EstimateMessage | Offset) -> None:
-        """Add a message."""
+    def add(self, message: Sample | EstimateMessage | Offset, now_ns: int) -> None:
+        """Add a message, and remove points that are no longer of the last day.
+
+        Parameters
+        ----------
+        message : Sample, EstimateMessage or Offset
+            A message of any time.
+        now_ns : int
+            The clock of the watch, ns since 1970 UTC.
+        """
+        self.prune(now_ns)
         bucket = message.time_utc_ns // STEP_NS
+        if not _is_of_the_day(bucket, now_ns):
+            return
         point = self._points.get(bucket)
         if point is None or message.seq > point["seq"]:
             point = self._points[bucket] = {"seq": message.seq, "time_utc_ns": message.time_utc_ns}
@@ -89,9 +106,11 @@ class MachineHistory:
             point["candidate_um"] = message.y_pred_um
 
     def prune(self, now_ns: int) -> None:
-        """Remove points older than a day."""
-        oldest = (now_ns - SPAN_NS) // STEP_NS
-        for bucket in [bucket for bucket in self._points if bucket < oldest]:
+        """Remove points older than a day, and those ahead, which remain if the clock was set back."""
+        if now_ns // STEP_NS == self._pruned:
+            return
+        self._pruned = now_ns // STEP_NS
+        for bucket in [bucket for bucket in self._points if not _is_of_the_day(bucket, now_ns)]:
             del self._points[bucket]
 
     def misfit(self, now_ns: int, minutes: int) -> tuple[float, float, int]:
@@ -170,6 +189,10 @@ def state_intervals(history: Mapping[str, Sequence[Any]], valid_for_s: float | N
         else:
             found.append(StateInterval(t, t + step_s, state, reasons or ""))
     return found[::-1]
+
+
+def _is_of_the_day(bucket: int, now_ns: int) -> bool:
+    return (now_ns - SPAN_NS) // STEP_NS <= bucket <= (now_ns + AHEAD_NS) // STEP_NS
 
 
 def usable(sample: Sample, name: str) -> float | None:

@@ -2,7 +2,7 @@
 const POLL_MS = 2000, MOST_ACTIONS = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
 const $ = (id) => document.getElementById(id);
-let past = {prefix: null, history: null}, drawn = "", lastAnswer = null, effects = [], current = null;
+let past = {prefix: null, history: null, now_s: Infinity}, drawn = "", lastAnswer = null, effects = [], current = null;
 
 const make = (tag, attributes = {}, ...children) => {
   const svg = ["svg", "path", "line", "text", "rect", "g"].includes(tag);
@@ -28,12 +28,14 @@ const stamp = (t_s) => `${day(t_s)} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
 const wordLink = (code) => make("a", {href: `#word=${$(`word=${code}`) ? code : code.split(":")[0]}`}, code);
+// A typed address may have a percent sign that encodes nothing.
+const unescaped = (text) => { try { return decodeURIComponent(text); } catch { return text; } };
 const alive = (machine) => ({true: "alive", false: "gone", null: "unknown"})[String(machine.alive)];
 
 // ---------------------------------------------------------------- requests
 
 function selected(machines) {
-  if (location.hash.startsWith("#m=")) current = decodeURIComponent(location.hash.slice(3));
+  if (location.hash.startsWith("#m=")) current = unescaped(location.hash.slice(3));
   else if (!location.hash.startsWith("#word=")) current = null;
   return current ?? (machines.length === 1 ? machines[0].prefix : null);
 }
@@ -118,14 +120,16 @@ function fillRow(row, machine) {
 // ---------------------------------------------------------------- one machine
 
 async function showOne(prefix, count) {
-  if (past.prefix !== prefix) { past = {prefix, history: null}; drawn = ""; shown = null; }
+  if (past.prefix !== prefix) { past = {prefix, history: null, now_s: Infinity}; drawn = ""; shown = null; }
   const times = past.history ? past.history.t_s : [];
-  // The newest points are requested again: their values come in several messages.
-  const since = times.length ? Math.max(times[times.length - 1] - 300, 0) : 0;
+  // The newest points are requested again: their values come in several messages. A point ahead of the watch's clock,
+  // which may have been set back, keeps no later one out.
+  const since = times.length ? Math.max(Math.min(times[times.length - 1], past.now_s) - 300, 0) : 0;
   const found = await ask(`machine.json?prefix=${encodeURIComponent(prefix)}&since_s=${since}`);
   const machine = found.machine;
   effects = found.effects;
   past.history = joined(past.history, found.history, found.now_s);
+  past.now_s = found.now_s;
   $("shop").hidden = true; $("machine").hidden = false; $("all").hidden = count < 2;
   setText($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
   document.title = `${SIGNS[machine.tone]} ${machine.machine} ${machine.shown}`;
@@ -259,7 +263,7 @@ function points(history) {
 function openCodes() {
   if (!location.hash.startsWith("#word=")) return;
   $("words").open = true;
-  const target = $(decodeURIComponent(location.hash.slice(1)));
+  const target = $(unescaped(location.hash.slice(1)));
   if (target) target.scrollIntoView();
 }
 addEventListener("hashchange", () => { openCodes(); update(); });

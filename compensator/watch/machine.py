@@ -26,7 +26,7 @@ from compensator.messages import (
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
 from compensator.watch.axes import axis_snapshot, worst
 from compensator.watch.cutting import Headline, headline
-from compensator.watch.history import MachineHistory, usable
+from compensator.watch.history import AHEAD_NS, MachineHistory, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import (
     CONFIG,
@@ -50,6 +50,8 @@ KINDS = {
 LONGEST = 2**20
 #: Events kept of each machine.
 EVENTS = 50
+#: Longest text of an event that is shown whole, characters; those of services are a few lines at most.
+TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
@@ -125,12 +127,14 @@ class WatchedMachine:
         #: Offsets of further axes.
         self._axes: dict[str, AxisOffset] = {}
         self._arrived_s = 0.0
+        #: When the other kept messages arrived, by their names in `_KEPT`.
+        self._kept_s: dict[str, float] = {}
         #: Another machine name received below the same prefix, and when.
         self._other: tuple[str, float] = ("", -1e9)
 
     # ------------------------------------------------------------------ messages
 
-    def update(self, kind: str, payload: bytes, monotonic_s: float, *, asked: bool = False) -> bool:
+    def update(self, kind: str, payload: bytes, now_ns: int, monotonic_s: float, *, asked: bool = False) -> bool:
         """Add a message; return whether it is new.
 
         Parameters
@@ -139,8 +143,8 @@ class WatchedMachine:
             `offset`, `sample`, `estimate`, `status` or `event`; `z_offset` and so on of further axes.
         payload : bytes
             JSON, or anything else.
-        monotonic_s : float
-            When it arrived, on a monotonic clock, s.
+        now_ns, monotonic_s : int, float
+            When it arrived: on the wall clock, ns since 1970 UTC, and on a monotonic clock, s.
         asked : bool
             Whether it is the answer to a query, which repeats an earlier message.
         """
@@ -157,10 +161,10 @@ class WatchedMachine:
                 self._other = (self.name, monotonic_s)
             self.name, self.numbers = message.machine, Sequence()
         if isinstance(message, Offset):
-            return self._update_offset(message, monotonic_s, asked)
-        return self._update_other(message)
+            return self._update_offset(message, now_ns, monotonic_s, asked)
+        return self._update_other(message, now_ns, monotonic_s)
 
-    def _update_offset(self, message: Offset, monotonic_s: float, asked: bool) -> bool:
+    def _update_offset(self, message: Offset, now_ns: int, monotonic_s: float, asked: bool) -> bool:
         if self._counts_anew(message, monotonic_s):
             self.numbers, self._offset, self._axes = Sequence(), None, {}
         # Answers are not counted: until the subscription has reached every service, messages between an answer and
@@ -170,8 +174,7 @@ class WatchedMachine:
         if self._offset is not None and message.machine == self._offset.machine and message.seq <= self._offset.seq:
             return False
         self._offset, self._arrived_s = message, monotonic_s
-        self.history.add(message)
-        self.history.prune(message.time_utc_ns)
+        self.history.add(message, now_ns)
         return True
 
     def _counts_anew(self, message: Offset, monotonic_s: float) -> bool:
@@ -200,7 +203,9 @@ class WatchedMachine:
         self._axes[axis] = message
         return True
 
-    def _update_other(self, message: Sample | EstimateMessage | Status | Event) -> bool:
+    def _update_other(
+        self, message: Sample | EstimateMessage | Status | Event, now_ns: int, monotonic_s: float
+    ) -> bool:
         """Add a message other than an offset; messages older than the last are ignored."""
         if isinstance(message, Event):
             if message in self.events:
@@ -213,10 +218,10 @@ class WatchedMachine:
             self.numbers.started(message.started_utc_ns)
             self.history.add_candidate(message)
         else:
-            self.history.add(message)
-        return self._keep(message)
+            self.history.add(message, now_ns)
+        return self._keep(message, monotonic_s)
 
-    def _keep(self, message: Sample | EstimateMessage | Status) -> bool:
+    def _keep(self, message: Sample | EstimateMessage | Status, monotonic_s: float) -> bool:
         """Keep the newest message of its kind; return whether this is the newest."""
         # Recorded estimates and status of several axes are subclasses.
         name = next(name for name, kind in _KEPT.items() if isinstance(message, kind))
@@ -224,16 +229,19 @@ class WatchedMachine:
         if known is not None and self._is_older(message, known):
             return False
         setattr(self, name, message)
+        self._kept_s[name] = monotonic_s
         return True
 
-    def add_recorded(self, message: Sample | EstimateMessage | Offset | Candidate | Event) -> None:
-        """Add a message of a recording to the history; a recorded offset is never shown as current."""
+    def add_recorded(
+        self, message: Sample | EstimateMessage | Offset | Candidate | Event, now_ns: int, monotonic_s: float
+    ) -> None:
+        """Add a message of a recording, read now, to the history; a recorded offset is never shown as current."""
         if isinstance(message, Candidate):
             self.history.add_recorded_candidate(message)
         elif not isinstance(message, Event):
-            self.history.add(message)
+            self.history.add(message, now_ns)
             if not isinstance(message, Offset):
-                self._keep(message)
+                self._keep(message, monotonic_s)
         elif message not in self.events:
             self.events = deque(sorted([*self.events, message], key=lambda e: e.time_utc_ns), maxlen=EVENTS)
 
@@ -276,7 +284,10 @@ class WatchedMachine:
                 Remark(WatchWarning.TWO_SERVICES, f"Two services publish below this prefix: {other} and {self.name}.")
             )
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
-            figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
+            ahead_ns = offset.time_utc_ns - now_ns
+            figures = f"Its clock is ahead of this computer's by {age(ahead_ns / NS)}."
+            if ahead_ns > AHEAD_NS:
+                figures += " Curves and tables are without its messages."
             found.append(Remark(WatchWarning.CLOCK_AHEAD, figures))
         if (
             offset is not None
@@ -343,7 +354,7 @@ class WatchedMachine:
             "alive": self.alive,
             "reasons": [words._asdict() for words in reasons],
             "to_do": _to_do(shown, reasons, warnings),
-            "headline": self._headline(shown, warnings, now_ns)._asdict(),
+            "headline": self._headline(shown, warnings, now_ns, monotonic_s)._asdict(),
             "warnings": list(warnings),
             "warning_codes": [warning.code for warning in warnings],
             "age_s": round(old_s, 3) if old_s is not None else None,
@@ -351,8 +362,8 @@ class WatchedMachine:
             "y_offset_rate_um_per_min": offset.y_offset_rate_um_per_min
             if offset and shown != WatchWarning.SILENT
             else None,
-            **self._estimated(now_ns),
-            **self._measured(now_ns),
+            **self._estimated(now_ns, monotonic_s),
+            **self._measured(now_ns, monotonic_s),
             "received": self.numbers.received,
             "missed": self.numbers.missed,
             "repeated": self.numbers.repeated,
@@ -360,23 +371,24 @@ class WatchedMachine:
             "last_malformed": self.last_malformed,
             "events": [self._event(event) for event in reversed(self.events)],
         }
-        loop = self._loop(status) if self._fresh(status, now_ns) else None
+        fresh = status if self._fresh("_status", now_ns, monotonic_s) else None
+        loop = self._loop(fresh)
         if loop is not None:
             found["loop"] = loop
         if isinstance(offset, AxisOffset):
             found["axes"] = axis_snapshot(offset, self._axes, silent=shown == WatchWarning.SILENT)
-        found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
+        found["probe"] = self._probe(fresh)
         return found | {name: getattr(status, name, None) for name in _STATUS}
 
-    def _headline(self, shown: str, warnings: list[Remark], now_ns: int) -> Headline:
+    def _headline(self, shown: str, warnings: list[Remark], now_ns: int, monotonic_s: float) -> Headline:
         """Return whether one may cut, and until when."""
-        status = self._status if self._fresh(self._status, now_ns) else None
+        status = self._status if self._fresh("_status", now_ns, monotonic_s) else None
         until = status.predicts_until_utc_ns if status is not None else UNSET
         return headline(
             shown=shown,
             tone=_tone(shown, warnings),
             reasons=self._worst()[1] if self._offset is not None else (),
-            channels=self._measured(now_ns)["channels"],
+            channels=self._measured(now_ns, monotonic_s)["channels"],
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
@@ -408,14 +420,17 @@ class WatchedMachine:
         commands = loop_commands(self.config) if _is_proposed(status) else ()
         return found | {"line": loop_text(found), "commands": list(commands)}
 
-    def _fresh(self, message: Any, now_ns: int) -> bool:
-        """Return whether a message is still valid by its own time."""
+    def _fresh(self, name: str, now_ns: int, monotonic_s: float) -> bool:
+        """Return whether a kept message is still valid by its own time, which may be ahead, and by its arrival."""
+        message: Sample | EstimateMessage | Status | None = getattr(self, name)
+        if message is None:
+            return False
         valid_s = self._offset.valid_for_s if self._offset else 150.0
-        return message is not None and (now_ns - message.time_utc_ns) / NS <= valid_s
+        return max((now_ns - message.time_utc_ns) / NS, monotonic_s - self._kept_s[name]) <= valid_s
 
-    def _estimated(self, now_ns: int) -> dict[str, Any]:
+    def _estimated(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         estimate = self._estimate
-        if estimate is None or not self._fresh(estimate, now_ns):
+        if estimate is None or not self._fresh("_estimate", now_ns, monotonic_s):
             return {**dict.fromkeys(_ESTIMATE), "shares": []}
         effects = [(name, value) for name, value in zip(self.effects(), estimate.y_effects_um, strict=False)]
         parts = [("DTF", estimate.y_dtf_um), ("TDTF", estimate.y_tdtf_um), *effects]
@@ -433,9 +448,9 @@ class WatchedMachine:
         named = list(self._status.effects) if self._status else []
         return named if len(named) == count else [f"effect {i + 1}" for i in range(count)]
 
-    def _measured(self, now_ns: int) -> dict[str, Any]:
+    def _measured(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         sample = self._sample
-        if sample is None or not self._fresh(sample, now_ns):
+        if sample is None or not self._fresh("_sample", now_ns, monotonic_s):
             return {"t_q_degc": None, "at_degc": None, "period_s": None, "channels": {}}
         channels: dict[str, Any] = {}
         for name, channel in sample.channels.items():
@@ -448,10 +463,15 @@ class WatchedMachine:
     def _event(self, event: Event) -> dict[str, Any]:
         return {
             "time_utc_ns": event.time_utc_ns,
-            "kind": event.kind,
-            "text": event.text,
-            "do": to_do(event, self.config),
+            "kind": _shortened(event.kind),
+            "text": _shortened(event.text),
+            "do": _shortened(to_do(event, self.config)),
         }
+
+
+def _shortened(text: str) -> str:
+    """Cut a text that no service writes: the page asks for all events every two seconds."""
+    return text if len(text) <= TEXT else f"{text[:TEXT]}…"
 
 
 def _tone(shown: str, warnings: list[Remark]) -> Tone:

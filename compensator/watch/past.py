@@ -9,7 +9,7 @@ from pathlib import Path
 from compensator.errors import DataError
 from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample
 from compensator.recording.reading import messages, recordings
-from compensator.watch.history import SPAN_NS
+from compensator.watch.history import AHEAD_NS, SPAN_NS
 
 _TOPICS = ("sample", "estimate", "offset", "candidate", "event")
 
@@ -19,7 +19,8 @@ def last_day(
 ) -> Iterator[Sample | EstimateMessage | Offset | Candidate | Event]:
     """Yield the messages of the last day in a machine's recordings; unreadable files are skipped.
 
-    The file that is being written is read up to its present end.
+    The file that is being written is read up to its present end. Messages ahead of now by more than `AHEAD_NS` are left
+    out: they would be shown as of now.
 
     Parameters
     ----------
@@ -33,4 +34,6 @@ def last_day(
     since_ns = now_ns - SPAN_NS
     for path in recordings(folder, machine):
         with suppress(DataError, OSError):
-            yield from messages(path, _TOPICS, since_ns=since_ns)
+            for message in messages(path, _TOPICS, since_ns=since_ns):
+                if message.time_utc_ns <= now_ns + AHEAD_NS:
+                    yield message

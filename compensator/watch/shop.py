@@ -10,7 +10,8 @@ from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, WatchedMachine
 from compensator.watch.words import CONFIG, TONES
 
-#: Largest number of machines; messages of further machines are only counted.
+#: Largest number of machines, also for Foxglove and for the losses of a recording; messages of further machines are
+#: only counted here.
 MACHINES = 1000
 _ORDER = {"bad": 0, "warn": 1, "good": 2}
 
@@ -56,7 +57,7 @@ class Shop:
             if machine is None or kind is None:
                 self.ignored += 1
             else:
-                machine.update(kind, payload, self._clock.monotonic_ns() / NS, asked=asked)
+                machine.update(kind, payload, self._clock.utc_ns(), self._clock.monotonic_ns() / NS, asked=asked)
 
     def set_alive(self, key: str, alive: bool) -> None:
         """Receive a change of a liveliness token, from any thread."""
@@ -78,7 +79,7 @@ class Shop:
             machine = self._machine(prefix)
             if machine is not None:
                 for message in messages:
-                    machine.add_recorded(message)
+                    machine.add_recorded(message, self._clock.utc_ns(), self._clock.monotonic_ns() / NS)
 
     def _machine(self, prefix: str) -> WatchedMachine | None:
         machine = self._machines.get(prefix)

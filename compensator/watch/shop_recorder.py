@@ -27,6 +27,7 @@ from compensator.recording.naming import day_of, names
 from compensator.recording.reading import recordings
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
+from compensator.watch.shop import MACHINES
 
 log = logging.getLogger("compensator")
 
@@ -74,7 +75,9 @@ class ShopRecorder:
         self._finisher = Finisher(folder, NAME, Retention(), None, compacted=_compacted)
         self._file: _File | None = None
         self._day, self._failed = "", False
-        self._numbers: dict[tuple[str, str], Sequence] = {}
+        #: Numbers by prefix and the rest of the key, of at most `MACHINES` machines.
+        self._numbers: dict[str, dict[str, Sequence]] = {}
+        self._not_counted = 0
         self.files: list[Path] = []
         self.messages = 0
         #: Number of messages that arrived but are in no file, because the disk failed for too long.
@@ -122,11 +125,17 @@ class ShopRecorder:
         text = f"{self.messages} messages in {len(self.files)} file(s) in {self._folder}; lost in transit: {lost}"
         if self.not_recorded:
             text += f"; not recorded, because the disk failed: {self.not_recorded}"
+        if self._not_counted:
+            text += f"; losses not counted beyond {MACHINES} machines: {self._not_counted} messages"
         return result, text
 
     def missed(self) -> dict[str, int]:
         """Return the number of lost messages of each key, by gaps in the sequence numbers."""
-        found = {f"{prefix}/thermal/{kind}": one.missed for (prefix, kind), one in self._numbers.items()}
+        found = {
+            f"{prefix}/thermal/{rest}": one.missed
+            for prefix, numbers in self._numbers.items()
+            for rest, one in numbers.items()
+        }
         return {key: count for key, count in sorted(found.items()) if count}
 
     # ------------------------------------------------------------------ on a separate thread
@@ -186,18 +195,25 @@ class ShopRecorder:
             message = None
         if message is None:
             return "other", 0, arrival.time_ns
-        numbers = self._numbers
+        self._count(prefix, rest, kind, message)
+        return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
+
+    def _count(self, prefix: str, rest: str, kind: str, message: Any) -> None:
+        """Count a message by its number; those of machines beyond `MACHINES` are recorded, but not counted."""
+        if prefix not in self._numbers and len(self._numbers) >= MACHINES:
+            self._not_counted += 1
+            return
+        numbers = self._numbers.setdefault(prefix, {})
         if kind in ("sample", "estimate") or axis_of(kind) is not None:
-            numbers.setdefault((prefix, rest), Sequence()).update(message.seq, message.time_utc_ns)
+            numbers.setdefault(rest, Sequence()).update(message.seq, message.time_utc_ns)
         started_ns = message.started_utc_ns if kind == "status" else 0
         if kind == "event" and message.kind == EventKind.START:
             started_ns = message.time_utc_ns
         for other in ("y/offset", "sample", "estimate") if started_ns else ():
-            numbers.setdefault((prefix, other), Sequence()).started(started_ns)
-        for (its_prefix, other), sequence in numbers.items() if started_ns else ():
-            if its_prefix == prefix and other.endswith("/offset") and other != "y/offset":
+            numbers.setdefault(other, Sequence()).started(started_ns)
+        for other, sequence in numbers.items() if started_ns else ():
+            if other.endswith("/offset") and other != "y/offset":
                 sequence.started(started_ns)
-        return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
 
     def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
         """Truncate the file to its last sync and queue the batch for another file."""

@@ -42,10 +42,11 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> SeveralAxes:
 def watched(machine: SeveralAxes, *, without: str = "") -> tuple[WatchedMachine, int]:
     """A watch that has received what was published, but nothing under one name."""
     seen = WatchedMachine(PREFIX)
+    now_ns = machine.outcomes[-1].offset.time_utc_ns + 1_000_000_000
     for name, data in machine.published:
         if name != without:
-            seen.update(name, data, 0.0)
-    return seen, machine.outcomes[-1].offset.time_utc_ns + 1_000_000_000
+            seen.update(name, data, now_ns, 0.0)
+    return seen, now_ns
 
 
 def test_a_table_has_the_columns_of_every_axis(machine: SeveralAxes, tmp_path: Path) -> None:
@@ -157,7 +158,7 @@ def test_the_worst_axis_is_the_machine_s_state(machine: SeveralAxes) -> None:
         later = msgspec.structs.replace(held, seq=held.seq + 1, time_utc_ns=now_ns)
         if axis == "x":
             later = msgspec.structs.replace(later, state="degraded", reasons=["rate_limited"])
-        seen.update("offset" if axis == "y" else "x_offset", msgspec.json.encode(later), 0.0)
+        seen.update("offset" if axis == "y" else "x_offset", msgspec.json.encode(later), now_ns, 0.0)
     snapshot = seen.snapshot(now_ns, 1.0)
     assert snapshot["shown"] == "degraded"
     assert [one["code"] for one in snapshot["reasons"]] == ["rate_limited"]
@@ -173,8 +174,8 @@ def test_an_axis_that_is_not_received_has_no_old_value(machine: SeveralAxes) -> 
 @pytest.mark.parametrize("payload", [b"nonsense", b'{"axes":1}', b"{}", b'{"axes":["z"],"axis":"z"}', b"\xff"])
 def test_no_payload_of_an_axis_ends_a_watch(machine: SeveralAxes, payload: bytes) -> None:
     seen, now_ns = watched(machine)
-    assert not seen.update("z_offset", payload, 0.0)
-    assert not seen.update("offset", payload, 0.0)
+    assert not seen.update("z_offset", payload, now_ns, 0.0)
+    assert not seen.update("offset", payload, now_ns, 0.0)
     assert seen.snapshot(now_ns, 1.0)["malformed"] == 2
 
 

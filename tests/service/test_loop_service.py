@@ -220,7 +220,7 @@ async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_p
         if isinstance(message, Candidate):
             seen.add_recorded_candidate(message)
         elif not isinstance(message, Event):
-            seen.add(message)
+            seen.add(message, machine.clock.utc_ns())
     found = machine.candidates()
     drawn = [value for value in seen.columns()["candidate_um"] if value is not None]
     assert len(drawn) == len({one.time_utc_ns // STEP_NS for one in found}) > 300

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from compensator.errors import ServiceError
-from compensator.watch import origin_gate
+from compensator.watch import foxglove, origin_gate
 from compensator.watch.foxglove import FoxgloveServer, topic_of
 from tests.watch.heard import START_NS, estimate, event, offset, sample
 from tests.watch.slow import drip
@@ -81,6 +81,15 @@ def test_a_viewer_that_joins_gets_the_last_events() -> None:
             viewer.until_advertised("/vmc-07/event")
             viewer.subscribe("/vmc-07/event")
             assert [viewer.message()[0] for _ in range(20)] == [START_NS + i for i in range(10, 30)]
+
+
+def test_machines_beyond_the_bound_have_no_channels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove, "MACHINES", 2)
+    with FoxgloveServer("shop", 0) as server:
+        for kind, payload in (("y/offset", offset(5)), ("event", event(5))):
+            for i in range(4):
+                server.receive(f"shop/n{i}/thermal/{kind}", payload)
+        assert set(server._channels) == set(server._latest) == {"/n0/offset", "/n1/offset", "/n0/event", "/n1/event"}
 
 
 def test_topics() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ import pytest
 from compensator.clock import NS
 from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import AxesEstimate
+from compensator.watch import past
 from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
 from compensator.watch.shop import Shop
@@ -83,6 +85,21 @@ def test_a_wall_clock_that_stands_does_not_keep_a_machine_alive(heard: Heard) ->
     heard.hear(offset=offset(5))
     heard.clock.monotonic += 151 * NS  # the wall clock was set back meanwhile
     assert heard.machine["shown"] == "silent"
+
+
+def test_values_of_a_service_whose_clock_is_ahead_expire_like_its_offset(heard: Heard) -> None:
+    t = START_NS + 3600 * NS
+    wanted = status(5, t, loop=LOOP, **(WANTED | {"probe_wanted": True}))
+    heard.hear(offset=offset(5, t), sample=sample(5, t), estimate=estimate(5, t), status=wanted)
+    heard.clock.advance(150)
+    machine = heard.machine
+    assert (machine["shown"], machine["t_q_degc"], machine["y_um"]) == ("ok", 31.5, 12.0)
+    assert machine["probe"]["wanted"] and "loop" in machine
+    heard.clock.advance(1)
+    machine = heard.machine
+    assert machine["shown"] == "silent" and machine["channels"] == {} and machine["shares"] == []
+    assert machine["t_q_degc"] is machine["y_um"] is machine["residual_um"] is machine["probe"] is None
+    assert "loop" not in machine
 
 
 def test_an_old_offset_that_arrives_now_is_silent_and_the_clocks_are_doubted(heard: Heard) -> None:
@@ -247,6 +264,15 @@ def test_events_say_what_to_do(heard: Heard) -> None:
     assert "resume" in newest["do"] and back["do"] == "" and "probe" in gone["do"]
 
 
+def test_a_text_that_no_service_writes_is_cut(heard: Heard) -> None:
+    heard.hear(event=event(5, text="x" * 2000))
+    heard.hear(event=event(6, kind="diagnosis", text="x" * 300_000, needs="y" * 300_000))
+    heard.hear(event=event(7, kind="z" * 300_000))
+    long_kind, long, whole = heard.machine["events"]
+    assert (long["text"], long["do"], long_kind["kind"]) == ("x" * 2000 + "…", "y" * 2000 + "…", "z" * 2000 + "…")
+    assert whole["text"] == "x" * 2000
+
+
 @pytest.mark.parametrize(
     ("kind", "data", "expected"),
     [
@@ -276,8 +302,8 @@ def test_machines_that_need_somebody_stand_first_and_strangers_are_counted(heard
 
 def test_effects_have_numbers_where_their_names_do_not_fit() -> None:
     machine = WatchedMachine("shop/vmc-07")
-    machine.update("estimate", estimate(5, effects=(1.0, 2.0)), 0.0)
-    machine.update("status", status(5), 0.0)
+    machine.update("estimate", estimate(5, effects=(1.0, 2.0)), START_NS, 0.0)
+    machine.update("status", status(5), START_NS, 0.0)
     assert machine.effects() == ["effect 1", "effect 2"]
 
 
@@ -285,9 +311,9 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
     machine = WatchedMachine("shop/vmc-07")
     for i in range(0, 3600, 10):  # an hour at ten seconds
         t = START_NS + i * NS
-        machine.update("offset", offset(i, t, y_offset_um=float(i)), i)
-        machine.update("sample", sample(i, t, t_q=float(i)), i)
-        machine.update("estimate", estimate(i, t, residual_um=float(i)), i)
+        machine.update("offset", offset(i, t, y_offset_um=float(i)), t, i)
+        machine.update("sample", sample(i, t, t_q=float(i)), t, i)
+        machine.update("estimate", estimate(i, t, residual_um=float(i)), t, i)
     columns = machine.history.columns()
     assert len(columns["t_s"]) == 60
     assert (
@@ -295,8 +321,36 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
     )
     since = machine.history.columns(START_NS + 1800 * NS)
     assert len(since["t_s"]) == 30
-    machine.update("offset", offset(10**6, START_NS + 25 * 3600 * NS), 0.0)
+    machine.update("offset", offset(10**6, START_NS + 25 * 3600 * NS), START_NS + 25 * 3600 * NS, 0.0)
     assert len(machine.history) == 1
+
+
+def test_a_message_ahead_of_time_is_no_point_of_the_day(heard: Heard) -> None:
+    """One would hold the page, which asks for what is newer than the last point, and would never be a day old."""
+    heard.hear(offset=offset(5, START_NS + 240 * NS))  # clocks differ by minutes
+    for i in range(3000):
+        heard.hear(estimate=estimate(6, START_NS + (3600 + 60 * i) * NS))
+        heard.hear(estimate=estimate(6, START_NS - 60 * i * NS))
+    t_s = [t - START_NS / NS for t in heard.shop.history("shop/vmc-07")["t_s"]]
+    assert t_s[0] == -24 * 3600 and t_s[-1] == 240 and len(t_s) == 24 * 60 + 2
+    heard.clock.now_ns -= 3600 * NS  # the clock was ahead
+    heard.hear(offset=offset(6, heard.clock.now_ns))
+    assert heard.shop.history("shop/vmc-07")["t_s"][-1] == heard.clock.now_ns / NS + 300
+
+
+def test_a_service_an_hour_ahead_is_shown_with_a_warning_and_without_points(heard: Heard) -> None:
+    for number, ahead_s, without in ((5, 240, False), (6, 3600, True)):
+        heard.hear(offset=offset(number, START_NS + ahead_s * NS))
+        assert (heard.machine["shown"], heard.machine["warning_codes"]) == ("ok", ["clock_ahead"])
+        assert ("are without its messages" in heard.machine["to_do"]) == without
+    assert len(heard.shop.history("shop/vmc-07")["t_s"]) == 1
+
+
+def test_a_recorded_message_ahead_of_time_is_not_of_the_last_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = [decoded("sample", sample(5 + i, START_NS + i * NS)) for i in (0, 240, 3600)]
+    monkeypatch.setattr(past, "recordings", lambda *_: [Path("vmc-07.mcap")])
+    monkeypatch.setattr(past, "messages", lambda *_, **__: iter(recorded))
+    assert list(past.last_day(Path(), "vmc-07", START_NS)) == recorded[:2]
 
 
 def test_the_past_of_a_recording_says_nothing_of_now() -> None:
@@ -309,24 +363,24 @@ def test_the_past_of_a_recording_says_nothing_of_now() -> None:
     ):
         message = decoded(kind, payload)
         assert isinstance(message, (Offset, Sample, EstimateMessage, Event))
-        machine.add_recorded(message)
+        machine.add_recorded(message, START_NS, 0.0)
     assert machine.shown(START_NS, 0.0) == "unknown" and machine.age_s(START_NS, 0.0) is None
     assert machine.history.columns()["y_offset_um"] == [-12.34]
     assert machine.snapshot(START_NS, 0.0)["t_q_degc"] == 31.5
     assert machine.snapshot(START_NS + 200 * NS, 0.0)["t_q_degc"] is None
-    machine.update("event", event(2, START_NS - NS), 0.0)
-    machine.update("event", event(3, kind="zero", text="zero"), 0.0)  # heard again
+    machine.update("event", event(2, START_NS - NS), START_NS, 0.0)
+    machine.update("event", event(3, kind="zero", text="zero"), START_NS, 0.0)  # heard again
     assert len(machine.events) == 2
 
 
 def test_the_recorded_day_of_a_machine_of_several_axes_is_shown() -> None:
     machine = WatchedMachine("shop/vmc-07")
     fields = json.loads(estimate(3)) | {"axes": {"z_pred_um": 4.0, "z_std_um": 0.5}}
-    machine.add_recorded(msgspec.convert(fields, AxesEstimate))
-    machine.add_recorded(msgspec.json.decode(sample(3), type=Sample))
+    machine.add_recorded(msgspec.convert(fields, AxesEstimate), START_NS, 0.0)
+    machine.add_recorded(msgspec.json.decode(sample(3), type=Sample), START_NS, 0.0)
     assert machine.history.columns()["residual_um"] == [-0.34]
     assert machine.snapshot(START_NS, 0.0)["residual_um"] == -0.34
-    machine.update("estimate", estimate(4, residual_um=0.5), 0.0)
+    machine.update("estimate", estimate(4, residual_um=0.5), START_NS, 0.0)
     assert machine.snapshot(START_NS, 0.0)["residual_um"] == 0.5
 
 
@@ -405,7 +459,7 @@ def test_the_commands_name_the_configuration_that_the_watch_was_given() -> None:
 
 def test_of_two_recorded_models_in_shadow_the_candidate_is_drawn() -> None:
     history = MachineHistory()
-    history.add(msgspec.json.decode(estimate(5), type=EstimateMessage))
+    history.add(msgspec.json.decode(estimate(5), type=EstimateMessage), START_NS)
     for role, y_um in (("before", 1.0), ("candidate", 2.0), ("before", 3.0)):
         history.add_recorded_candidate(
             Candidate(
@@ -434,7 +488,7 @@ def test_of_two_recorded_models_in_shadow_the_candidate_is_drawn() -> None:
 
 def test_the_prediction_of_the_shadow_is_in_the_history_of_its_sample() -> None:
     history = MachineHistory()
-    history.add(msgspec.json.decode(estimate(5, y_pred_um=14.34), type=EstimateMessage))
+    history.add(msgspec.json.decode(estimate(5, y_pred_um=14.34), type=EstimateMessage), START_NS)
     assert "candidate_um" not in history.columns()
     for number in (5, 7):  # the other one is of a sample that did not arrive
         history.add_candidate(msgspec.json.decode(status(number, loop=LOOP), type=Status))

@@ -191,7 +191,9 @@ def test_a_port_that_is_taken_is_one_line(server: PageServer) -> None:
         PageServer(Shop(Clock()), lambda: STATUS, port).__enter__()
 
 
-def drawn(address: str, folder: Path, width: int, zone: str = "UTC", scheme: int = 1) -> tuple[str, str]:
+def drawn(
+    address: str, folder: Path, width: int, zone: str = "UTC", scheme: int = 1, budget_ms: int = 4000
+) -> tuple[str, str]:
     """Return the page as a browser has it, and what its console said."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
@@ -206,7 +208,7 @@ def drawn(address: str, folder: Path, width: int, zone: str = "UTC", scheme: int
             "--dump-dom",
             f"--window-size={width},900",
             f"--blink-settings=preferredColorScheme={scheme}",
-            "--virtual-time-budget=4000",
+            f"--virtual-time-budget={budget_ms}",
             "--enable-logging=stderr",
             address,
         ],
@@ -230,6 +232,33 @@ def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServ
     assert "&lt;img src=x" in text and "<img" not in text
     assert "gain DTF" in text and "spindle" not in text
     assert re.search(r"<td>⚠ degraded</td><td>\d+ min</td><td>t_q_missing</td>", text)
+
+
+def test_a_page_goes_on_after_the_clock_of_the_watch_was_set_back(tmp_path: Path) -> None:
+    clock = Clock()
+    shop = Shop(clock)
+    key = "shop/vmc-07/thermal/y/offset"
+    shop.receive(key, offset(5, y_offset_um=-11.11))
+    asked: list[int] = []
+
+    def status() -> dict[str, Any]:
+        asked.append(clock.now_ns)
+        if len(asked) == 3:  # the page has drawn its points
+            clock.now_ns -= 7200 * NS
+            shop.receive(key, offset(6, clock.now_ns, y_offset_um=-22.22))
+        return STATUS
+
+    with PageServer(shop, status, 0) as served:
+        text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 400, budget_ms=12_000)
+    assert console == "" and len(asked) > 6
+    assert re.search(r'<table id="points".*<td>−22.22</td>', text, re.DOTALL) and "<td>−11.11</td>" not in text
+
+
+@pytest.mark.parametrize("part", ["word=%zz", "m=%zz"])
+def test_an_address_with_a_stray_percent_sign_is_drawn(server: PageServer, tmp_path: Path, part: str) -> None:
+    text, console = drawn(f"{server.address}#{part}", tmp_path, 400)
+    said = "2 machines: 2 ok" if part.startswith("word") else "No messages from %zz."
+    assert console == "" and said in text
 
 
 def test_a_browser_draws_the_shop(server: PageServer, tmp_path: Path) -> None:

@@ -104,6 +104,20 @@ def test_what_never_arrived_is_counted_and_a_restart_is_not(tmp_path: Path) -> N
     assert topic == "/summary" and json.loads(summary) == {name: result[name] for name in json.loads(summary)}
 
 
+def test_machines_beyond_the_bound_are_recorded_and_their_losses_not_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shop_recorder, "MACHINES", 2)
+    keys = [f"shop/n{i}/thermal/sample" for i in range(4)]
+    with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
+        for number in (5, 7):
+            for key in keys:
+                recorder.receive(key, sample(number))
+    assert recorder.missed() == dict.fromkeys(keys[:2], 1) and len(recorder._numbers) == 2
+    assert "losses not counted beyond 2 machines: 4 messages" in recorder.answer()[1]
+    assert len(read(recordings(tmp_path)[0])) == 8
+
+
 def test_each_day_has_its_file(tmp_path: Path) -> None:
     clock = Clock()
     with ShopRecorder(tmp_path, "shop", clock) as recorder:
