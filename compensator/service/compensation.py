@@ -144,7 +144,7 @@ class Compensation(Continuity):
             estimate = self._judge_jumps(sample, values, notes) or self._engine.step(
                 values.t_q, values.at, values.others
             )
-            self._jumps.observe(values.y, self._zero.y_ref - self._zero.y_base, estimate)
+            self._jumps.observe(self._engine, values.y, self._zero.y_ref - self._zero.y_base, estimate)
             self._memory.estimate = estimate
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]

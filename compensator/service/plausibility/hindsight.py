@@ -4,9 +4,9 @@ Both look alike in the temperatures: the end of a drift, of a couple that stuck 
 jump. What the channel showed before is then in the state of every engine, for hours. Here Y is a measurement of that
 state, in two engines that begin with the jump. Both doubt what the channel has shown before, by its jump, in each of
 some past times independently: so Y tells them what was wrong. The *mended* one takes the channel as it is. The *broken*
-one takes it less its jump, and Y by how it stood to the prediction before: then that was the model's error. The one
-that expects Y, the temperatures and the heat better is right. A third engine goes on by Y without the channel: from
-there both begin again, both with Y since the zero, when it jumps again.
+one takes it less its jump, and Y by how it stood to the prediction before: then that was the model's error, which is
+the less likely the larger it is. The one that expects Y, the temperatures and the heat better is right. A third engine
+goes on by Y without the channel: from there both begin again, both with Y since the zero, when it jumps again.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ _LEAST_K = 2.0
 _DECIDES, _SAMPLES, _MOST = 12.0, 10, 30.0
 #: A value of Y counts for no more than this many squared deviations, and half: errors of Y last some samples.
 _CLIP2, _WEIGHT = 25.0, 0.5
+#: A model may err by this many times what it states, before more speaks for a sensor that was wrong; so much at most.
+_MODEL_ERRS, _MOST_BEFORE = 15.0, 15.0
 #: Least variance of a value of Y, µm².
 _LEAST_UM2 = 0.01
 
@@ -67,10 +69,13 @@ class Hindsight:
     ----------
     model : ThermalModel
         The model; one whose T_Q is late by a dead time is not judged.
+    y_std_um : float
+        Standard deviation of Y − prediction that is stated, µm.
     """
 
-    def __init__(self, model: ThermalModel) -> None:
+    def __init__(self, model: ThermalModel, y_std_um: float) -> None:
         self._model = model
+        self._y_std_um = max(y_std_um, math.sqrt(_LEAST_UM2))
         self._histories: dict[str, list[Vector]] = {}
         self._broken, self._mended, self._without = Engine(model), Engine(model), Engine(model)
         self._jumps_k: dict[str, float] = {}
@@ -154,6 +159,9 @@ class Hindsight:
             if not self._again:
                 self._without.restore(self._mended.snapshot())
             self._jumps_k, self._ratio, self._samples = dict(jumps_k), 0.0, 0
+            if not self._again and not math.isnan(grown.by_level):
+                missed = (grown.by_zero - grown.by_level) / (_MODEL_ERRS * self._y_std_um)
+                self._ratio = min(0.5 * missed * missed, _MOST_BEFORE)
         t_q, at = measured["t_q_degc"], measured["at_degc"]
         t_q_less, at_less = (value - jumps_k.get(name, 0.0) for name, value in (("t_q_degc", t_q), ("at_degc", at)))
         t_q_else, at_else = (NAN if name in jumps_k else measured[name] for name in ("t_q_degc", "at_degc"))

@@ -125,6 +125,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         State of the watch of the other channel, while one is suspect.
     hindsight : HindsightState, optional
         Whether suspect channels were wrong before their jump; of the watch as a whole.
+    learning : int
+        Samples for which Y goes on to correct what they have left in the state; of the watch as a whole.
     """
 
     level_um: float = NAN
@@ -157,6 +159,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     zero_in_use: Estimate | None = None
     beside: JumpState | None = None
     hindsight: HindsightState | None = None
+    learning: Count = 0
 
     @property
     def is_suspect(self) -> bool:
@@ -251,7 +254,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     def without_engines(self) -> JumpState:
         """Return a copy without the states of the engines and of the watch beside."""
         engines = dict.fromkeys(("believing", "shifted", "zero_in_use", "beside", "hindsight"))
-        return copy.deepcopy(msgspec.structs.replace(self, **engines))
+        return copy.deepcopy(msgspec.structs.replace(self, learning=0, **engines))
 
     def branches(self) -> list[Branch]:
         """Return the states of all engines, those of the watch beside included."""

@@ -30,6 +30,8 @@ _NATURAL = 0.5
 #: Weight of a new residual in the level before a jump, and of the difference of two in a row in the noise of Y; at
 #: most so many deviations of it count, for a chip is no noise.
 _LEVEL, _NOISE, _MOST_NOISE = 0.1, 0.02, 5.0
+#: Samples for which Y corrects what a fault has left, and deviations beyond which a value of Y is wrong itself.
+_LEARNING, _FAR = 120, 5.0
 
 
 class JumpWatch:
@@ -52,7 +54,7 @@ class JumpWatch:
             y_std_um=stated or model.y_std_um,
         )
         self._jump = OneJump(self._setup)
-        self._hindsight = Hindsight(model)
+        self._hindsight, self._learning = Hindsight(model, self._setup.y_std_um), 0
         self._level_um = self._zero_um = NAN
         self._noise_um2, self._last_um = 0.0, NAN
         self._learned_um = 0.0
@@ -99,6 +101,7 @@ class JumpWatch:
             last_um=self._last_um,
             learned_um=self._learned_um,
             hindsight=self._hindsight.state,
+            learning=self._learning,
         )
 
     def restore(self, state: JumpState | None) -> None:
@@ -112,7 +115,7 @@ class JumpWatch:
         state = state or JumpState()
         jump = OneJump.restored(self._setup, state)
         self._hindsight.restore(state.hindsight)
-        self._jump = jump
+        self._jump, self._learning = jump, state.learning
         self._level_um, self._zero_um = state.level_um, state.zero_um
         self._noise_um2, self._last_um = max(state.noise_um2, 0.0), state.last_um
         self._learned_um, self._estimate = state.learned_um, None
@@ -133,11 +136,13 @@ class JumpWatch:
         self._level_um = self._zero_um = y_um if self._jump.is_open else NAN
         self._learned_um = 0.0
         self._hindsight.end()
+        self._learning = 0
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._jump.pass_time(samples, held=held)
         self._hindsight.end()
+        self._learning = 0
 
     def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
@@ -189,16 +194,18 @@ class JumpWatch:
             level_std_um=self._std_um(),
             zero_std_um=self._std_um(at_zero=True),
         )
-        then = engine.snapshot() if self._jump.is_open else None
+        # In its first sample a jump may have been used: the state that both answers begin with is that of the next one.
+        then = engine.snapshot() if self.suspects else None
         found = self._jump.judge(engine, measured, fast, others, grown)
-        found = self._in_hindsight(engine, then, found, measured, others, grown)
+        if then is not None:
+            found = self._in_hindsight(engine, then, found, measured, others, grown)
         self._forget(*before)
         return found
 
     def _in_hindsight(
         self,
         engine: Engine,
-        then: EngineState | None,
+        then: EngineState,
         found: Judgement,
         measured: Mapping[str, float],
         others: Mapping[str, float],
@@ -211,13 +218,14 @@ class JumpWatch:
             self._hindsight.end()
             return found
         jumps_k = {name: size for name, size in self._jump.sizes_k().items() if name in suspects}
-        mended = self._hindsight.judge(then or engine.snapshot(), jumps_k, measured, others, grown)
+        mended = self._hindsight.judge(then, jumps_k, measured, others, grown)
         if mended is None:
             return found
         state, estimate = mended
         engine.restore(state)
         self._jump.end()
         self._hindsight.end()
+        self._learning = _LEARNING
         notes = [mended_note(name, jumps_k[name]) for name in suspects]
         return Judgement(estimate, [*found.notes, *notes], {name: measured[name] for name in suspects}, found.zeros)
 
@@ -242,11 +250,13 @@ class JumpWatch:
         self._jump.receive_probe(grown_um, math.hypot(std_um, self._setup.y_std_um))
         self._learned_um += learned_um
 
-    def observe(self, y_um: float, zero_um: float, estimate: Estimate) -> None:
+    def observe(self, engine: Engine, y_um: float, zero_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow what measured Y is compared with after a later jump.
 
         Parameters
         ----------
+        engine : Engine
+            Engine of the compensation; what a fault has left in its state is corrected.
         y_um, zero_um : float
             Measured Y, and what it is without deformation by the zero, µm; NaN if it is not known.
         estimate : Estimate
@@ -258,6 +268,7 @@ class JumpWatch:
             return
         self._jump.state.count_quiet()
         self._zero_um = zero_um
+        self._learn(engine, y_um - zero_um - estimate.y_um)
         residual = y_um - estimate.y_um
         change, self._last_um = residual - self._last_um, residual
         if not math.isnan(change):
@@ -267,6 +278,15 @@ class JumpWatch:
             return
         known = not math.isnan(self._level_um)
         self._level_um = self._level_um + _LEVEL * (residual - self._level_um) if known else residual
+
+    def _learn(self, engine: Engine, residual_um: float) -> None:
+        """Correct by Y what a fault has left in the state: a few values do not tell its fast part from its slow one."""
+        if self._learning == 0:
+            return
+        self._learning -= 1
+        variance_um2 = self._std_um(at_zero=True) ** 2
+        if residual_um * residual_um < _FAR * _FAR * (variance_um2 + engine.y_noise_std_um**2):  # not for NaN either
+            engine.measure_y(residual_um, variance_um2)
 
     def _std_um(self, *, at_zero: bool = False) -> float:
         """Return the deviation of a value of Y − prediction, µm: own error of the model, and noise of Y."""
