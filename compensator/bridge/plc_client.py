@@ -40,8 +40,6 @@ INTEGERS = (
     ua.VariantType.Int64,
     ua.VariantType.UInt64,
 )
-#: Raised if a connection is lost, refused or does not answer.
-_GONE = (OSError, ua.UaError, asyncio.TimeoutError, ConnectionError)
 
 
 class PlcClient(ABC):
@@ -69,6 +67,7 @@ class PlcClient(ABC):
         self._report = report
         self._reported = ""
         self._beat = 0
+        self._served = False
 
     @abstractmethod
     async def _prepare(self, client: Client) -> None:
@@ -84,13 +83,15 @@ class PlcClient(ABC):
         Raises
         ------
         ConfigError
-            Where a node is of a type that cannot hold its value.
+            Where a node is of a type that cannot hold its value, at the first connection.
         """
         while not stop.is_set():
             try:
                 async with await self._client() as client:
                     await self._serve(client, stop)
-            except _GONE as error:
+            except Exception as error:
+                if isinstance(error, ConfigError) and not self._served:
+                    raise
                 figures = f"{self._connection.endpoint}: {type(error).__name__} {error}".rstrip(". ")
                 self.register.lost(Remark(BridgeTrouble.PLC_NOT_REACHED, f"{figures}.").marked)
             await self._wait_disconnected(stop)
@@ -115,6 +116,7 @@ class PlcClient(ABC):
 
     async def _serve(self, client: Client, stop: asyncio.Event) -> None:
         await self._prepare(client)
+        self._served = True
         self.register.lost("")
         while not stop.is_set():
             await self._cycle()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
-from compensator.errors import ConfigError
-from compensator.input_file import resolved
+from compensator.errors import ConfigError, one_line
+from compensator.input_file import KEY_BYTES, read_file, resolved
 from compensator.receiver import ReceiverError, Settings, load_settings
 from compensator.receiver.settings import read_table
 
@@ -153,15 +155,54 @@ def with_files(opcua: C, path: str) -> C:
     Raises
     ------
     ConfigError
-        Where one is not there.
+        Where one is not there, or cannot be read.
     """
     folder = Path(path).parent
     given = {key: getattr(opcua, key) for key in _FILES}
     files: dict[str, Any] = {key: str(resolved(folder / name)) for key, name in given.items() if name}
     for key, file in files.items():
+        where = f"{path}: opcua.{key} = {given[key]!r}"
         if not Path(file).is_file():
-            raise ConfigError(f"{path}: opcua.{key} = {given[key]!r}: no such file")
+            raise ConfigError(f"{where}: no such file")
+        try:
+            _READ[key](read_file(Path(file), KEY_BYTES))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"{where}: {one_line(str(error))}, expected {_EXPECTED[key]}") from error
     return replace(opcua, **files)
+
+
+def _certificate(data: bytes) -> None:
+    from cryptography import x509  # with asyncua, the extra of this bridge
+
+    (x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate)(data)
+
+
+def _private_key(data: bytes) -> None:
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric import rsa
+
+    load = serialization.load_pem_private_key if data.startswith(b"-----") else serialization.load_der_private_key
+    try:
+        key = load(data, password=None)
+    except UnsupportedAlgorithm as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(key, rsa.RSAPrivateKey):
+        raise ValueError("a key of another kind")
+
+
+_READ: dict[str, Callable[[bytes], object]] = {
+    "password_file": lambda data: data.decode("utf-8"),
+    "certificate": _certificate,
+    "private_key": _private_key,
+    "server_certificate": _certificate,
+}
+_EXPECTED = {
+    "password_file": "a password in UTF-8",
+    "certificate": "an X.509 certificate, PEM or DER",
+    "private_key": "an RSA key without a password, PEM or DER",
+    "server_certificate": "an X.509 certificate, PEM or DER",
+}
 
 
 def check_value(one: Any, where: str) -> None:
@@ -186,7 +227,12 @@ def check_connection(opcua: Connection, path: str) -> None:
 
     if opcua.unit not in UNITS_UM:
         raise wrong("unit", f"one of {', '.join(UNITS_UM)}")
-    if not opcua.endpoint.startswith("opc.tcp://"):
+    try:
+        url = urlsplit(opcua.endpoint)
+        is_endpoint = url.scheme == "opc.tcp" and bool(url.hostname) and url.port is not None
+    except ValueError:  # a port that is none, a bracket that is not closed
+        is_endpoint = False
+    if not is_endpoint:
         raise wrong("endpoint", "opc.tcp://HOST:PORT")
     bounds = {
         "cycle_s": (0.05, 10.0),

@@ -5,17 +5,22 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
-from asyncua import ua
+from asyncua import Client, ua
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
 
 from compensator.bridge.opcua import Bridge
-from compensator.bridge.plc_client import _GONE, real
+from compensator.bridge.plc_client import real
 from compensator.bridge.settings import load_bridge
 from compensator.cli import main
 from compensator.errors import ConfigError
@@ -222,6 +227,8 @@ async def _near(plc: Plc, um: float) -> bool:
         ("cycle_s", "cycles_s", "opcua.cycles_s: unknown key"),
         ("cycle_s = 0.05", "cycle_s = 0.0", "opcua.cycle_s = 0.0: expected 0.05 to 10"),
         ('"opc.tcp:', '"http:', "expected opc.tcp://HOST:PORT"),
+        ('"opc.tcp://', '"opc.tcp://[::1', "expected opc.tcp://HOST:PORT"),
+        ('"opc.tcp://', '"opc.tcp://:x', "expected opc.tcp://HOST:PORT"),
         ("retry_s", 'user = "x"\nretry_s', "user and password_file together"),
         ("retry_s", 'security_policy = "None"\nretry_s', "opcua.security_policy = 'None': expected one of"),
         ("retry_s", 'certificate = "c.der"\nretry_s', "private_key and server_certificate together"),
@@ -237,6 +244,56 @@ def test_it_does_not_start_like_this(
     assert expected in refused(written(tmp_path, **{old: new}), capsys)
 
 
+def self_signed() -> tuple[bytes, bytes]:
+    """Return a private key and its certificate, PEM."""
+    key = rsa.generate_private_key(65537, 2048)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "bridge")])
+    builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    builder = builder.serial_number(1).not_valid_before(datetime(2026, 1, 1)).not_valid_after(datetime(2046, 1, 1))
+    pem = serialization.Encoding.PEM
+    private = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    return private, builder.sign(key, hashes.SHA256()).public_bytes(pem)
+
+
+@pytest.mark.parametrize("key", ["certificate", "private_key", "server_certificate", "password_file"])
+def test_a_file_that_cannot_be_read_is_refused_before_the_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str
+) -> None:
+    (tmp_path / "junk").write_bytes(b"\xff\xfe no certificate, no key, no text")
+    right = {"certificate": "c.pem", "private_key": "k.pem", "server_certificate": "c.pem"}
+    for name, data in zip(("k.pem", "c.pem"), self_signed(), strict=True):
+        (tmp_path / name).write_bytes(data)
+    files = {"password_file": "junk"} if key == "password_file" else right | {key: "junk"}
+    more = "".join(f'{name} = "{file}"\n' for name, file in files.items())
+    more += 'user = "x"\n' if key == "password_file" else 'security_policy = "Basic256Sha256"\n'
+    assert f"opcua.{key} = 'junk': " in refused(written(tmp_path, retry_s=f"{more}retry_s"), capsys)
+
+
+@pytest.mark.parametrize("error", [AssertionError(), struct.error("unpack"), IndexError("x"), TypeError("y")])
+async def test_no_answer_of_a_server_ends_the_bridge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """What asyncua raises on an answer that it cannot read may be anything; also while it connects."""
+    left = [error, error]
+    connect = Client.connect
+
+    async def breaks(client: Client) -> None:
+        if left:
+            raise left.pop()
+        await connect(client)
+
+    monkeypatch.setattr(Client, "connect", breaks)
+    async with (
+        Plc(free_port(), 0.0) as plc,
+        bridging(written(tmp_path, plc.endpoint, free_port()), []) as bridge,
+    ):
+
+        async def is_ready() -> bool:
+            return not left and not bridge.register.trouble
+
+        await until(is_ready, lambda: bridge.register.trouble)
+
+
 def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bridge", "opcua", "--config", str(written(tmp_path)), "--check", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sign"] == -1
@@ -250,7 +307,7 @@ def test_the_trial_without_a_plc_can_be_loaded() -> None:
 @pytest.mark.parametrize("value", [None, [1.0], "1.0", True, object()])
 def test_a_node_that_holds_no_number_is_trouble_and_no_end(value: object) -> None:
     """The bridge takes it for a PLC that is not ready, says so in one line, and tries again."""
-    with pytest.raises(_GONE, match="must hold a number"):
+    with pytest.raises(ua.UaError, match="must hold a number"):
         real(value)
 
 

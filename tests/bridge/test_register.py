@@ -39,6 +39,16 @@ def test_goes_on_from_what_the_plc_holds() -> None:
     assert r.check(1.0, -0.002) and r._follower.applied_um == pytest.approx(2.0) and not r.trouble
 
 
+def test_a_foreign_value_that_is_gone_is_no_trouble_and_the_next_one_has_to_stand_again() -> None:
+    r = register()
+    assert r.check(0.0, 0.0)
+    r.wrote(0.004)
+    assert not r.check(1.0, 0.050) and r.trouble
+    assert r.check(2.0, 0.004) and not r.trouble
+    assert not r.check(3600.0, 0.050) and not r.check(3604.0, 0.050) and r.trouble
+    assert r.check(3605.1, 0.050)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -0.0501, 1e30])
 def test_nothing_is_written_over_what_cannot_be(value: float) -> None:
     r = register()
