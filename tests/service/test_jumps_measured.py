@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from compensator.errors import DataError
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.state import decode_state
+from compensator.service.state import decode_state, encode_state
 from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
 from tests.service.records import QUILL, sample
 
@@ -88,6 +89,21 @@ def test_what_y_has_shown_since_a_jump_survives_a_restart(day: dict[str, np.ndar
             parts = again
         assert parts.process(sample(i, values)) == whole.process(sample(i, values))
     assert parts.state() == whole.state() and decode_state(whole.state()).jumps is not None
+
+
+@pytest.mark.parametrize("jumps_k", [{}, {"y_um": 3.0}, {"t_q_degc": 1.0, "heat_w": 2.0}])
+def test_a_hindsight_of_no_temperature_is_refused(day: dict[str, np.ndarray], jumps_k: dict[str, float]) -> None:
+    compensation = Compensation(settings({"false_alarm_days": 30.0}), QUILL)
+    change = drifts("t_q_degc", 1.5, 180, 420)
+    for i in range(424):
+        values = readings(day, i)
+        change(i, values)
+        compensation.process(sample(i, values))
+    state = decode_state(compensation.state())
+    assert state.jumps is not None and state.jumps.hindsight is not None
+    state.jumps.hindsight.jumps_k = jumps_k
+    with pytest.raises(DataError, match="hindsight"):
+        Compensation(settings({"false_alarm_days": 30.0}), QUILL).restore(encode_state(state))
 
 
 @pytest.mark.parametrize(("begin", "end"), [(300, 360), (400, 450)])

@@ -11,6 +11,7 @@ goes on by Y without the channel: from there both begin again, both with Y since
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 
@@ -21,6 +22,7 @@ from compensator.messages import Count, Number
 from compensator.model.engine import Engine, EngineState, Estimate, wrong_histories
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.grown_y import GrownY
+from compensator.service.plausibility.guards import TEMPERATURES
 
 #: Limits of the past times that a channel may have been wrong in, samples before its jump.
 _AGES = (0, 10, 20, 40, 80, 160, 320, 640)
@@ -77,9 +79,20 @@ class Hindsight:
         self._model = model
         self._y_std_um = max(y_std_um, math.sqrt(_LEAST_UM2))
         self._histories: dict[str, list[Vector]] = {}
-        self._broken, self._mended, self._without = Engine(model), Engine(model), Engine(model)
         self._jumps_k: dict[str, float] = {}
         self._ratio, self._samples, self._again = 0.0, 0, False
+
+    @functools.cached_property
+    def _broken(self) -> Engine:
+        return Engine(self._model)
+
+    @functools.cached_property
+    def _mended(self) -> Engine:
+        return Engine(self._model)
+
+    @functools.cached_property
+    def _without(self) -> Engine:
+        return Engine(self._model)
 
     @property
     def state(self) -> HindsightState | None:
@@ -105,6 +118,8 @@ class Hindsight:
             If it does not belong to the model; nothing is changed then.
         """
         if state is not None:
+            if not state.jumps_k or not set(state.jumps_k) <= set(TEMPERATURES):
+                raise ValueError(f"state of a hindsight of {list(state.jumps_k)}, expected {' or '.join(TEMPERATURES)}")
             pairs = (self._broken, state.broken), (self._mended, state.mended), (self._without, state.without)
             for engine, one in pairs:
                 engine.check(one)
@@ -146,12 +161,10 @@ class Hindsight:
         EngineState, Estimate
             Those of the mended engine, if the channels were wrong before and are right now; None otherwise.
         """
-        if not self._mended.takes_y:
+        if (not self._jumps_k and math.isnan(grown.by_zero)) or not self._mended.takes_y:
             return None
         if self._jumps_k != dict(jumps_k):
             self._again, doubts = bool(self._jumps_k), self._doubts(jumps_k)
-            if not self._again and math.isnan(grown.by_zero):
-                return None
             begun = self._without.snapshot() if self._again else before
             for engine in (self._broken, self._mended):
                 engine.restore(begun)
