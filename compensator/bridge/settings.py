@@ -166,7 +166,7 @@ def with_files(opcua: C, path: str) -> C:
             raise ConfigError(f"{where}: no such file")
         try:
             _READ[key](read_file(Path(file), KEY_BYTES))
-        except (ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise ConfigError(f"{where}: {one_line(str(error))}, expected {_EXPECTED[key]}") from error
     return replace(opcua, **files)
 

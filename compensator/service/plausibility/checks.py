@@ -345,7 +345,9 @@ class PlausibilityCheck:
         if not (state.exchanged and self._ends_exchange and state.below_min == 0.0):
             return
         last = state.blocks[-_RIGHT_BLOCKS:]
-        if all(abs(b.residual_um) / _RIGHT_SHARE < abs(b.predicted_um) > _MOVED * b.std_um for b in last):
+        if len(last) == _RIGHT_BLOCKS and all(
+            abs(b.residual_um) / _RIGHT_SHARE < abs(b.predicted_um) > _MOVED * b.std_um for b in last
+        ):
             self.acknowledge()
             self._note(Implausibility.TOGETHER, "measured Y agrees with T_Q and AT: they are not exchanged any more")
 

@@ -164,6 +164,8 @@ class JumpWatch:
         """
         before = self._before()
         found = self._jump.release(engine, used, new_zero=new_zero)
+        self._hindsight.end()
+        self._learning = 0
         self._forget(*before)
         return found
 
@@ -197,7 +199,10 @@ class JumpWatch:
         # In its first sample a jump may have been used: the state that both answers begin with is that of the next one.
         then = engine.snapshot() if self.suspects else None
         found = self._jump.judge(engine, measured, fast, others, grown)
-        if then is not None:
+        if then is None:
+            self._hindsight.end()
+        else:
+            self._learning = 0
             found = self._in_hindsight(engine, then, found, measured, others, grown)
         self._forget(*before)
         return found
@@ -227,7 +232,9 @@ class JumpWatch:
         self._hindsight.end()
         self._learning = _LEARNING
         notes = [mended_note(name, jumps_k[name]) for name in suspects]
-        return Judgement(estimate, [*found.notes, *notes], {name: measured[name] for name in suspects}, found.zeros)
+        return Judgement(
+            estimate, [*found.notes, *notes], found.accepted | {name: measured[name] for name in suspects}, found.zeros
+        )
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float, learned_um: float) -> None:
         """Compare both engines with a probe.
