@@ -15,7 +15,7 @@ from asyncua.crypto import security_policies
 from cryptography import x509
 
 from compensator.bridge.register import Registers
-from compensator.bridge.settings import Connection
+from compensator.bridge.settings import Connection, certificate_of
 from compensator.codes import BridgeTrouble, Remark
 from compensator.errors import ConfigError
 from compensator.input_file import KEY_BYTES, read_file
@@ -154,8 +154,7 @@ class PlcClient(ABC):
 def _application_uri(path: Path) -> str:
     data = read_file(path, KEY_BYTES)
     try:
-        read = x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate
-        names = read(data).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = certificate_of(data).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (ValueError, x509.ExtensionNotFound):
         return ""
     return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")

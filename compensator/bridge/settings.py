@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 from compensator.errors import ConfigError, one_line
 from compensator.input_file import KEY_BYTES, read_file, resolved
 from compensator.receiver import ReceiverError, Settings, load_settings
 from compensator.receiver.settings import read_table
+
+if TYPE_CHECKING:
+    from cryptography.x509 import Certificate
 
 #: µm for each unit that the PLC may use.
 UNITS_UM = {"mm": 1000.0, "um": 1.0}
@@ -171,10 +174,11 @@ def with_files(opcua: C, path: str) -> C:
     return replace(opcua, **files)
 
 
-def _certificate(data: bytes) -> None:
+def certificate_of(data: bytes) -> Certificate:
+    """Return the certificate of a file, PEM or DER; ValueError if it is none."""
     from cryptography import x509  # with asyncua, the extra of this bridge
 
-    (x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate)(data)
+    return (x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate)(data)
 
 
 def _private_key(data: bytes) -> None:
@@ -193,9 +197,9 @@ def _private_key(data: bytes) -> None:
 
 _READ: dict[str, Callable[[bytes], object]] = {
     "password_file": lambda data: data.decode("utf-8"),
-    "certificate": _certificate,
+    "certificate": certificate_of,
     "private_key": _private_key,
-    "server_certificate": _certificate,
+    "server_certificate": certificate_of,
 }
 _EXPECTED = {
     "password_file": "a password in UTF-8",

@@ -85,11 +85,11 @@ def jump_note(name: str, shift_k: float, then: str = "and is not used until its 
     )
 
 
-def mended_note(name: str, size_k: float) -> Note:
-    """Return the event of a channel that was wrong before its jump, by measured Y."""
+def accepted_note(name: str, size_k: float, how: str) -> Note:
+    """Return the event that a channel is used again."""
     return Note(
         EventKind.PLAUSIBILITY,
-        f"{NAMES[name]} is used again: measured Y shows that it was wrong before its jump of {size_k:+.2f} K",
+        f"{NAMES[name]} {how}",
         {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": size_k},
     )
 

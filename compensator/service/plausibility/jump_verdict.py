@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from compensator.events import EventKind, Implausibility, Note
+from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
 from compensator.service.plausibility.jump_engines import (
     NEAR,
@@ -18,7 +18,15 @@ from compensator.service.plausibility.jump_engines import (
     needed_samples,
 )
 from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_good_enough, is_unlikely
-from compensator.service.plausibility.jump_signs import AIR, FITS, LEFT, NAMES, RESTED, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import (
+    AIR,
+    FITS,
+    LEFT,
+    RESTED,
+    accepted_note,
+    jump_note,
+    unconfirmed_note,
+)
 from compensator.service.plausibility.jump_state import JumpState, Phase
 
 #: A jump within the permitted rate is watched for this number of samples.
@@ -126,14 +134,7 @@ def _accept(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str
 ) -> Verdict:
     names = list(state.jumps)
-    notes = [
-        Note(
-            EventKind.PLAUSIBILITY,
-            f"{NAMES[name]} {how}",
-            {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": state.jumps[name].size_k},
-        )
-        for name in names
-    ]
+    notes = [accepted_note(name, state.jumps[name].size_k, how) for name in names]
     estimate = engines.give(engine, run) if run is not None else None
     return Verdict(estimate, notes, {name: offered[name] for name in names}, ends=True)
 

@@ -21,7 +21,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.hindsight import Hindsight
-from compensator.service.plausibility.jump_signs import JumpSigns, mended_note
+from compensator.service.plausibility.jump_signs import JumpSigns, accepted_note
 from compensator.service.plausibility.jump_state import JumpState
 from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
 
@@ -135,14 +135,12 @@ class JumpWatch:
         self._jump.set_zero(used)
         self._level_um = self._zero_um = y_um if self._jump.is_open else NAN
         self._learned_um = 0.0
-        self._hindsight.end()
-        self._learning = 0
+        self._end_hindsight()
 
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._jump.pass_time(samples, held=held)
-        self._hindsight.end()
-        self._learning = 0
+        self._end_hindsight()
 
     def release(self, engine: Engine, used: Estimate | None, *, new_zero: bool) -> Judgement:
         """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
@@ -164,8 +162,7 @@ class JumpWatch:
         """
         before = self._before()
         found = self._jump.release(engine, used, new_zero=new_zero)
-        self._hindsight.end()
-        self._learning = 0
+        self._end_hindsight()
         self._forget(*before)
         return found
 
@@ -231,10 +228,15 @@ class JumpWatch:
         self._jump.end()
         self._hindsight.end()
         self._learning = _LEARNING
-        notes = [mended_note(name, jumps_k[name]) for name in suspects]
+        how = "is used again: measured Y shows that it was wrong before its jump of"
+        notes = [accepted_note(name, jumps_k[name], f"{how} {jumps_k[name]:+.2f} K") for name in suspects]
         return Judgement(
             estimate, [*found.notes, *notes], found.accepted | {name: measured[name] for name in suspects}, found.zeros
         )
+
+    def _end_hindsight(self) -> None:
+        self._hindsight.end()
+        self._learning = 0
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float, learned_um: float) -> None:
         """Compare both engines with a probe.
