@@ -192,6 +192,8 @@ class Compensation(Continuity):
         found = self._jumps.update(self._engine, sample.channels, values.others, values.y)
         notes += found.notes
         self._follow(found)
+        if found.ends_exchange and self.plausibility.exchanged:
+            self.plausibility.acknowledge()
         return found.estimate
 
     def _follow(self, found: Judgement) -> None:

@@ -59,13 +59,14 @@ class Shadow:
         for note in outcome.notes:
             if note.kind == EventKind.ZERO:
                 self.compensation.zero(note.data["mode"])
-        if self.compensation.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in outcome.offset.reasons:
-            # A person has seen to the couples: a warm-up passes samples, zeros and probes, and no commands.
-            self.compensation.resume()
         probes = tuple(probe for probe in outcome.probes if _is_compared(probe))
         received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
         self.compensation.receive_probes([probe for probe in received if probe is not None])
-        return msgspec.structs.replace(outcome, probes=probes), self.compensation.process(outcome.sample)
+        other = self.compensation.process(outcome.sample)
+        if self.compensation.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in outcome.offset.reasons:
+            # A person has seen to the couples: a warm-up passes samples, zeros and probes, and no commands.
+            self.compensation.resume()
+        return msgspec.structs.replace(outcome, probes=probes), other
 
 
 def _is_compared(probe: Probe) -> bool:

@@ -12,6 +12,7 @@ from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.jump_state import Branch, ChannelJump, JumpState, Phase
+from compensator.service.plausibility.swapped import Ways, exchange_of, other_way_round, ways
 
 #: A value counts as expected within this number of standard deviations.
 NEAR = 4.0
@@ -25,6 +26,8 @@ _MOST_STEPS = 2
 _UNSTEADY = 2
 #: Samples for which AT may be on its way back from a jump within the permitted rate; slower moves are the air's.
 _MOST_MOVING = 3
+#: Samples for which exchanged channels may be neither the one nor the other way; the fewer before they are sure to be.
+_MOST_CHANGING = 10
 #: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
 UNSEEN_SAMPLES = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
@@ -58,10 +61,11 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Fed:
-    """Values for the shifted engine, °C, and the channels that have jumped in this sample."""
+    """Values for the shifted engine, °C; the channels that have jumped in this sample; whether it shows an exchange."""
 
     values: dict[str, float]
     jumped: list[str]
+    is_exchange: bool = False
 
 
 class _Move(Enum):
@@ -122,6 +126,8 @@ class JumpEngines:
         is_open = bool(state.jumps)
         if not (are_both == is_open == (state.phase != Phase.NONE)) or not set(state.jumps) <= set(TEMPERATURES):
             raise ValueError("state of a jump that is incomplete")
+        if state.may_be_exchanged and len(state.jumps) != len(TEMPERATURES):
+            raise ValueError("state of an exchange of one channel")
         if not set(state.jumps) <= set(state.last):
             raise ValueError("state of a jump of a channel without a value")
         beside = state.beside
@@ -229,6 +235,11 @@ class JumpEngines:
         least_k : float
             Smallest jump that is looked for, K: from there on what is left of one after a return is another zero.
         """
+        if state.may_be_exchanged:
+            exchanged = self._feed_exchanged(state, offered, change_k["t_q_degc"])
+            if exchanged is not None:
+                return exchanged
+            state.exchanged = "no"
         values: dict[str, float] = {}
         new: list[str] = []
         for name in TEMPERATURES:
@@ -251,7 +262,33 @@ class JumpEngines:
             if move in {_Move.JUMPS, _Move.GOES_ON}:
                 new.append(name)
                 _enter_jump(state, name, difference, std, goes_on=move == _Move.GOES_ON)
-        return Fed(values, new)
+        may_be_exchanged = new and not is_unsteady(state) and (state.age == 0 or not state.is_unconfirmed)
+        if may_be_exchanged and not any(map(math.isnan, offered.values())):
+            state.exchanged = exchange_of(self.shifted.engine, offered)
+            # Beside AT that has jumped T_Q may look like one whose heat is switched off.
+            for name in TEMPERATURES if state.may_be_exchanged else ():
+                if name not in new:
+                    new.append(name)
+                    expected, std = expected_value(self.shifted.engine, name, NAN)
+                    _enter_jump(state, name, offered[name] - expected, std, goes_on=False)
+                values[name] = NAN
+        return Fed(values, new, state.exchanged == "yes")
+
+    def _feed_exchanged(self, state: JumpState, offered: Mapping[str, float], t_q_change_k: float) -> Fed | None:
+        """Return what the shifted engine is given of exchanged channels; None if they are no longer."""
+        is_missing = any(map(math.isnan, offered.values()))
+        found = ways(self.shifted.engine, offered, t_q_change_k) if not is_missing else Ways.NEITHER
+        for jump in state.jumps.values():
+            jump.back = jump.back + 1 if found == Ways.STRAIGHT else 0
+        if found == Ways.NEITHER:
+            state.moving += not is_missing
+            most = _MOST_CHANGING if state.exchanged == "yes" else _MOST_MOVING
+            return Fed(dict.fromkeys(TEMPERATURES, NAN), []) if state.moving < most else None
+        state.moving = 0
+        is_straight = found in {Ways.STRAIGHT, Ways.RATHER_STRAIGHT}
+        is_new = found == Ways.SWAPPED and state.exchanged == "perhaps"
+        state.exchanged = "yes" if is_new else state.exchanged
+        return Fed(dict(offered) if is_straight else other_way_round(offered), [], is_new)
 
     def goes_away(self, state: JumpState, offered: Mapping[str, float]) -> bool:
         """Return whether the channels that have jumped move further away from what the shifted engine expects."""
@@ -284,8 +321,9 @@ class JumpEngines:
 
     def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
-        if is_unsteady(state):
+        if is_unsteady(state) or state.may_be_exchanged:
             # The shifted engine goes without the channel: this would compare what they know, not whether it is right.
+            # Of exchanged ones it is given what fits.
             return
         cost = 0.0
         for run, values, sign in ((self.believing, offered, -0.5), (self.shifted, fed.values, 0.5)):

@@ -23,6 +23,9 @@ BESIDE, LEFT, FITS = (
     "too little for measured Y or probes to tell",
 )
 
+#: What follows from the jumps of exchanged channels.
+EXCHANGED = "to what the other one read: exchanged plugs, wires or addresses; neither is used until they are back"
+
 NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from enum import StrEnum
+from typing import Literal
 
 import msgspec
 
@@ -15,6 +16,9 @@ from compensator.service.plausibility.hindsight import HindsightState
 
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
+
+
+Exchanged = Literal["no", "perhaps", "yes"]
 
 
 class Phase(StrEnum):
@@ -95,8 +99,10 @@ class JumpState(msgspec.Struct, kw_only=True):
         Samples since the last jump.
     ratio : float
         Log likelihood ratio of the believing over the shifted engine.
+    exchanged : {"no", "perhaps", "yes"}
+        Whether T_Q and AT read each other's temperature; perhaps: the last sample may be a mean of both ways.
     moving : int
-        Consecutive samples for which AT of `Phase.AIR` has been on its way back.
+        Consecutive samples for which AT of `Phase.AIR`, or exchanged channels, have been on their way back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
     last : dict of str to float
@@ -144,6 +150,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     unseen: dict[str, Count] = {}
     samples: Count = 0
     ratio: Number = 0.0
+    exchanged: Exchanged = "no"
     moving: Count = 0
     at_held: Count = 0
     y_for: Count = 0
@@ -175,6 +182,11 @@ class JumpState(msgspec.Struct, kw_only=True):
     def is_air(self) -> bool:
         """Whether AT alone is in question, and may have shown the air."""
         return self.phase in {Phase.AIR, Phase.AIR_RETURNED}
+
+    @property
+    def may_be_exchanged(self) -> bool:
+        """Whether T_Q and AT may read each other's temperature."""
+        return self.exchanged != "no"
 
     @property
     def is_watched(self) -> bool:

@@ -215,8 +215,10 @@ class JumpWatch:
     ) -> Judgement:
         """Use suspect channels again if measured Y shows that they were wrong before their jump and are right now."""
         suspects = self._jump.suspects
-        # What was believed at a zero since the jump is not known here, and a loose contact may be right for a while.
-        if not suspects or self._jump.is_loose or self._jump.zero_in_use is not None:
+        # What was believed at a zero since the jump is not known here, and a loose contact may be right for a while. Of
+        # exchanged channels it is known what they were before, and will be.
+        no_question = self._jump.is_loose or self._jump.is_exchanged
+        if not suspects or no_question or self._jump.zero_in_use is not None:
             self._hindsight.end()
             return found
         jumps_k = {name: size for name, size in self._jump.sizes_k().items() if name in suspects}

@@ -26,7 +26,15 @@ from compensator.service.plausibility.jump_engines import (
     stds,
 )
 from compensator.service.plausibility.jump_evidence import is_contradicted, weigh_probe, weigh_y
-from compensator.service.plausibility.jump_signs import AIR, BESIDE, UNSEEN, JumpSigns, jump_note, unconfirmed_note
+from compensator.service.plausibility.jump_signs import (
+    AIR,
+    BESIDE,
+    EXCHANGED,
+    UNSEEN,
+    JumpSigns,
+    jump_note,
+    unconfirmed_note,
+)
 from compensator.service.plausibility.jump_state import JumpState, Phase
 from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
 
@@ -47,6 +55,8 @@ class Judgement(msgspec.Struct, frozen=True):
         the same.
     gives : bool
         Whether the engine was given another state.
+    ends_exchange : bool
+        Whether exchanged channels read their own temperature again.
     """
 
     estimate: Estimate | None = None
@@ -54,6 +64,7 @@ class Judgement(msgspec.Struct, frozen=True):
     accepted: dict[str, float] = {}
     zeros: tuple[Estimate, Estimate] | None = None
     gives: bool = False
+    ends_exchange: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +134,11 @@ class OneJump:
     def is_loose(self) -> bool:
         """Whether a channel in question has jumped again and again."""
         return is_unsteady(self.state) or (self._beside is not None and self._beside.is_loose)
+
+    @property
+    def is_exchanged(self) -> bool:
+        """Whether T_Q and AT may read each other's temperature."""
+        return self.state.may_be_exchanged
 
     def sizes_k(self) -> dict[str, float]:
         """Return the jumps of all channels in question, K."""
@@ -299,6 +315,7 @@ class OneJump:
             Deformation since the zero by measured Y.
         """
         before, was_unconfirmed, was_new = self.zero_in_use, self.state.is_unconfirmed, self._engines is None
+        was_exchanged = self.state.may_be_exchanged
         if self._engines is not None:
             self._engines.has_given = False
         own = [name for name in fast if name in self._names and not self._is_for_beside(name)]
@@ -318,6 +335,8 @@ class OneJump:
         count_held(self.state, engine, offered["at_degc"], self._setup.least_k)
         new = [name for name in fed.jumped if was_new or name in seen_again]
         notes += self._entered(engine, engines, offered, fed, [name for name in jumped if name in fed.jumped], new)
+        if fed.is_exchange:
+            notes += [jump_note(name, jump.size_k, EXCHANGED) for name, jump in self.state.jumps.items()]
         engines.weigh(self.state, offered, fed)
         beside = self._judge_beside(engines, measured, fast, fed, others, grown_y, unseen)
         offered |= dict.fromkeys(self._beside_suspects, NAN)
@@ -330,7 +349,7 @@ class OneJump:
             # What the other channel has shown is undone in the engine that goes on without this one, too.
             estimate = engines.give(engine, engines.shifted)
             self.state.phase = Phase.SUSPECT
-        elif was_unconfirmed and self.state.is_suspect:
+        elif (was_unconfirmed or (was_new and self.state.may_be_exchanged)) and self.state.is_suspect:
             estimate = engines.go_without(engine, self.suspects, offered, others)
         verdict = self._verdict(engine, engines, offered)
         estimate = verdict.estimate or estimate
@@ -344,6 +363,7 @@ class OneJump:
             beside.accepted | verdict.accepted,
             _moved(before, engines.zero_in_use),
             engines.has_given,
+            was_exchanged and verdict.has_returned,
         )
 
     def _jumped(
@@ -396,10 +416,12 @@ class OneJump:
         state = self.state
         if not fed.jumped:
             return []
+        if state.may_be_exchanged and not state.is_suspect:
+            state.phase = Phase.SUSPECT
         if state.is_suspect:
             self._believe_anew(engine, engines, offered)
             state.start_evidence()
-            return [jump_note(name, state.jumps[name].size_k) for name in told]
+            return [jump_note(name, state.jumps[name].size_k) for name in told] if not fed.is_exchange else []
         if not state.is_unconfirmed:
             return []
         when = {name: UNSEEN if name in unseen else BESIDE for name in fed.jumped}

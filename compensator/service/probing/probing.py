@@ -129,21 +129,24 @@ class Probing:
         return ProbingHandover(self.state)
 
     def continue_from(self, handover: ProbingHandover) -> None:
-        """Continue from the probes of another compensation, at the same sample and without a jump.
+        """Continue from the probes of another compensation, at the same sample.
 
-        The samples are those that this one has predicted, with the offsets that the other one has published.
+        The samples are those that this one has predicted, with the offsets that the other one has published. What it
+        has learned itself from the probes since the same zero stays: with that it was compared.
         """
         before = handover.state or ProbingState(correction={})
         own = {sample.time_ns: sample for sample in self._state.samples}
-        # The gains of another model start anew: what they correct at this moment goes into the offset.
         common = [sample for sample in before.samples if sample.time_ns in own]
-        if common and common[-1] is before.samples[-1]:
+        has_learned = self._correction.active and 0 < self._state.zero_ns == before.zero_ns
+        if not (common and common[-1] is before.samples[-1]):
+            # The successor has no prediction yet, so there is nothing that the correction could be added to.
+            self._correction = ProbeCorrection(self._names)
+        elif not has_learned:
+            # The gains of another model start anew: what they correct at this moment goes into the offset.
             then, now = common[-1], own[common[-1].time_ns]
             self._correction = ProbeCorrection.from_dict(before.correction).transferred(
                 self._names, then.contributions_um, now.contributions_um, now.y_um - then.y_um
             )
-        else:  # The successor has no prediction yet, so there is nothing that the correction could be added to.
-            self._correction = ProbeCorrection(self._names)
         self._state = ProbingState(
             correction={},
             samples=[_as_published(own[sample.time_ns], sample) for sample in common],
