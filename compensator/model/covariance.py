@@ -413,22 +413,29 @@ class Covariance:
         if y_var > self.y_var:
             self._replace(p)
 
-    def measure_y(self, variance_um2: float) -> tuple[list[float], float]:
-        """Take a measured y after the sample's other measurements; return its gain and the variance expected of it.
+    def gain_of_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> tuple[list[float], float]:
+        """Return the gain of a measured y after the sample's other measurements, and the variance expected of it.
 
         Parameters
         ----------
         variance_um2 : float
             Variance of the value itself, µm².
+        of_y : sequence of (int, float)
+            States of y, and by how much it changes with each.
         """
-        p = self.p
+        column, s = self._column_of_y(variance_um2, of_y)
+        return (column / s).tolist(), s
+
+    def measure_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> None:
+        """Take a measured y, whose gain is that of `gain_of_y`."""
+        column, s = self._column_of_y(variance_um2, of_y)
+        self._replace(_corrected(self.p, column / s, column, s))
+
+    def _column_of_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> tuple[Vector, float]:
         column = np.zeros(self.size)
-        for state, weight in self._of_y:
-            column = column + weight * p[:, state]
-        s = variance_um2 + sum(weight * float(column[state]) for state, weight in self._of_y)
-        gain = column / s
-        self._replace(_corrected(p, gain, column, s))
-        return gain.tolist(), s
+        for state, weight in of_y:
+            column = column + weight * self.p[:, state]
+        return column, variance_um2 + sum(weight * float(column[state]) for state, weight in of_y)
 
     def doubt(self, changes: Iterable[Sequence[float] | Vector]) -> None:
         """Widen it by errors of the state that are independent of each other, each of its own size.

@@ -27,6 +27,8 @@ from compensator.model.thermal_model import ThermalModel
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
 BRIDGE_SAMPLES = 60
+#: Step by which the growth of y with the paths is found, µm, and iterations of a correction by measured y.
+_SLOPE_UM, _ITERATIONS = 1.0, 6
 #: Samples within which a covariance is steady.
 _SETTLES_IN = 1500
 
@@ -411,7 +413,33 @@ class Engine:
         variance_um2 : float
             Variance of the value itself, µm².
         """
-        return self._observer.measure_y(residual_um, variance_um2)
+        observer, before = self._observer, self._observer.shares_of(0, self._observer.x)
+        y_before, slopes = self._y_of(*before), self._slopes_of_y(*before)
+        gain, expected = observer.gain_of_y(variance_um2, slopes)
+        innovation, effects = residual_um, self._parts[0].effects
+        # Effects may amplify what the paths do: then the slopes are those where the correction leads to (iterated EKF).
+        for _ in range(_ITERATIONS if effects else 0):
+            moved = [innovation * share for share in observer.shares_of(0, [*gain, 0.0])]
+            now = before[0] + moved[0], before[1] + moved[1]
+            slopes = self._slopes_of_y(*now)
+            gain, _ = observer.gain_of_y(variance_um2, slopes)
+            linear = slopes[0] * moved[0] + slopes[1] * moved[1]
+            innovation = residual_um - (self._y_of(*now) - y_before) + linear
+        observer.measure_y(innovation, variance_um2, slopes)
+        return expected
+
+    def _y_of(self, dtf: float, tdtf: float) -> float:
+        """Return y with other shares of DTF and TDTF now, effects included, µm."""
+        signals = self._signals(dtf, tdtf)
+        return dtf + tdtf + math.fsum(effect.peek(signals) for effect in self._parts[0].effects)
+
+    def _slopes_of_y(self, dtf: float, tdtf: float) -> tuple[float, float]:
+        """Return by how much y changes with the shares of DTF and TDTF there."""
+        if not self._parts[0].effects:
+            return 1.0, 1.0
+        now = self._y_of(dtf, tdtf)
+        by_dtf, by_tdtf = self._y_of(dtf + _SLOPE_UM, tdtf) - now, self._y_of(dtf, tdtf + _SLOPE_UM) - now
+        return by_dtf / _SLOPE_UM, by_tdtf / _SLOPE_UM
 
     @property
     def takes_y(self) -> bool:

@@ -115,13 +115,12 @@ class Observer:
             further += [self._behind, nothing]
         self._lay_out(ttf, dtf, tdtf, ambient, *further)
         self._outputs = self._output_rows(model)
-        weights = ((self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2]))
         self._covariance = Covariance(
             Design(
                 rows=tuple(self._rows),
                 first=tuple(self._first),
                 feed=tuple(self._d),
-                of_y=tuple((index, weight) for index, weight in weights if index < self.size),
+                of_y=self._of_y(1.0, 1.0),
                 walk=(*[0.0] * self._q, walk_std**2, estimator.at_walk_std_k**2),
                 t_q_var_k2=estimator.t_q_noise_std_k**2,
                 at_var_k2=estimator.at_noise_std_k**2,
@@ -330,24 +329,32 @@ class Observer:
 
     # ------------------------------------------------------------------ a measured deformation
 
-    def measure_y(self, residual_um: float, variance_um2: float) -> float:
-        """Correct the state after a sample by a measured y.
+    def _of_y(self, dtf: float, tdtf: float) -> tuple[tuple[int, float], ...]:
+        """Return the states of y, and by how much it changes with each if with the shares of the paths by so much."""
+        dtf_feed, tdtf_feed = self._d[1], self._d[2]
+        weights = (
+            *((self._first[1], dtf), (self._q, dtf * dtf_feed)),
+            *((self._first[2], tdtf), (self._a, tdtf * tdtf_feed)),
+        )
+        return tuple((index, weight) for index, weight in weights if index < self.size)
+
+    def gain_of_y(self, variance_um2: float, slopes: tuple[float, float]) -> tuple[list[float], float]:
+        """Return the gain of a measured y after a sample, and the variance expected of its residual, µm².
 
         Parameters
         ----------
-        residual_um : float
-            Measured − estimated y, µm.
         variance_um2 : float
             Variance of the value itself, µm².
-
-        Returns
-        -------
-        float
-            Variance that was expected of the residual, µm².
+        slopes : tuple of two floats
+            By how much y changes with the shares of DTF and TDTF: 1 without effects.
         """
-        gain, expected = self._covariance.measure_y(variance_um2)
+        return self._covariance.gain_of_y(variance_um2, self._of_y(*slopes))
+
+    def measure_y(self, residual_um: float, variance_um2: float, slopes: tuple[float, float]) -> None:
+        """Correct the state by a measured y, whose gain is that of `gain_of_y`; the residual is measured − expected."""
+        gain, _ = self.gain_of_y(variance_um2, slopes)
+        self._covariance.measure_y(variance_um2, self._of_y(*slopes))
         self._correct(gain, residual_um)
-        return expected
 
     def doubt(self, changes: Sequence[Sequence[float] | Vector]) -> None:
         """Widen the covariance by errors that the state may have, each one standard deviation of a change of it."""

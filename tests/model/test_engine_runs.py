@@ -16,7 +16,7 @@ from compensator.errors import ModelError
 from compensator.model.effects import Effect, effect_from, kinds, register
 from compensator.model.effects.base import number, text
 from compensator.model.effects.blocks import Block
-from compensator.model.engine import Engine, Estimate
+from compensator.model.engine import Engine, Estimate, wrong_histories
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import ThermalModel
 
@@ -337,3 +337,23 @@ def test_bad_model_files_get_one_line(old: str, new: str, expected: str) -> None
 def test_no_model_in_a_file_is_said(data: bytes) -> None:
     with pytest.raises(ModelError):
         parse_model(data, source="m.toml")
+
+
+@pytest.mark.parametrize("change", [0.0, 3.0])
+def test_measured_y_leads_the_state_to_it_also_where_an_effect_amplifies_it(change: float) -> None:
+    """A step by the paths alone would overshoot by what the curve adds, further each time."""
+    t_q, at = temperatures()
+    cube = effect_from("nonlinear", {"path": "DTF", "form": "cube", "change": change})
+    model = dataclasses.replace(QUILL, effects=(cube,))
+    engine, other = (Engine(model) for _ in range(2))
+    for one in (engine, other):
+        one.set_reference(float(t_q[0]), float(at[0]))
+    for i in range(200):  # heat from sample 120 on, which one of them does not see
+        engine.step(float(t_q[i]), float(at[i]))
+        other.step(float(t_q[100]) if i > 100 else float(t_q[i]), float(at[i]))
+    other.doubt([10.0 * np.array(history) for history in wrong_histories(model, (0, 20, 60, 120))[0]])
+    for i in range(200, 260):
+        right, found = engine.step(float(t_q[i]), float(at[i])), other.step(math.nan, float(at[i]))
+        other.measure_y(right.y_um - found.y_um, 0.01)
+        assert abs(found.y_um) < 1000.0
+    assert found.y_um == pytest.approx(right.y_um, abs=2.0)

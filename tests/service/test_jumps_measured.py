@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from compensator.errors import DataError
+from compensator.messages import number
+from compensator.model.effects import effect_from
+from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state, encode_state
 from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
@@ -62,6 +67,27 @@ def test_after_a_drift_is_mended_the_offset_is_right_within_an_hour(
     wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True)))
     assert np.max(wrong[end : end + 5]) > 5.0 and np.max(wrong[end + 60 :]) < 5.0
     assert any("measured Y shows that it was wrong" in note.text for o in outcomes for note in o.notes)
+
+
+@pytest.mark.parametrize("form", ["square", "odd square", "cube"])
+@pytest.mark.parametrize("change", [-0.6, 1.0, 3.0])
+@pytest.mark.parametrize("channel", ["t_q_degc", "at_degc"])
+def test_a_curve_of_the_model_does_not_lead_a_hindsight_astray(
+    day: dict[str, np.ndarray], form: str, change: float, channel: str
+) -> None:
+    """Y corrects the state of three engines, one of them without T_Q: a curve amplifies each correction."""
+    curve = effect_from("nonlinear", {"path": "DTF", "form": form, "change": change})
+    model = dataclasses.replace(QUILL, effects=(curve,), y_std_um=0.5)
+    healthy = [number(o.estimate.y_pred_um) for o in run(day, model=model)]
+    columns = day | {"y_um": np.array(healthy)}
+    mend = 420
+    outcomes = followed(
+        columns, drifts(channel, 1.5, 180, mend), model=model, residual_std_um=0.5, false_alarm_days=30.0
+    )
+    wrong = np.abs(offsets(outcomes) - offsets(run(columns, model=model, y=True)))
+    assert np.all(np.isfinite(wrong[1:]))
+    late = [i for i, o in enumerate(outcomes) if i > mend + 60 and o.offset.state == "ok" and wrong[i] > 5.0]
+    assert not late
 
 
 @pytest.mark.parametrize("size", [4.0, -4.0, 9.0])
@@ -131,11 +157,12 @@ def followed(
     *,
     restart: int | None = None,
     residual_std_um: float = 2.3,
+    model: ThermalModel = QUILL,
     **checks: float,
 ) -> list[Outcome]:
     """Run with a Y whose deviation hides a small jump, or with another one; perhaps with a restart."""
     conf = settings({"residual_std_um": residual_std_um, **checks})
-    compensation, outcomes = Compensation(conf, QUILL), []
+    compensation, outcomes = Compensation(conf, model), []
     for i in range(len(day["t_s"])):
         if i == restart:
             state = compensation.state()

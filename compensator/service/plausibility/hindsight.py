@@ -34,6 +34,8 @@ _DECIDES, _SAMPLES, _MOST = 12.0, 10, 30.0
 _CLIP2, _WEIGHT = 25.0, 0.5
 #: A model may err by this many times what it states, before more speaks for a sensor that was wrong; so much at most.
 _MODEL_ERRS, _MOST_BEFORE = 15.0, 15.0
+#: No machine is deformed by so much, µm.
+_MOST_UM = 1e4
 #: Least variance of a value of Y, µm².
 _LEAST_UM2 = 0.01
 
@@ -182,8 +184,12 @@ class Hindsight:
         by_level = (grown.by_level, max(grown.level_std_um**2, _LEAST_UM2))
         mended_cost, mended = _stepped(self._mended, t_q, at, others, by_zero)
         as_before = by_zero if self._again or math.isnan(grown.by_level) else by_level
-        broken_cost, _ = _stepped(self._broken, t_q_less, at_less, others, as_before)
-        _stepped(self._without, t_q_else, at_else, others, by_zero)
+        broken_cost, broken = _stepped(self._broken, t_q_less, at_less, others, as_before)
+        _, without = _stepped(self._without, t_q_else, at_else, others, by_zero)
+        if not all(abs(one.y_um) < _MOST_UM for one in (mended, broken, without)):
+            # Y has led a state astray by an effect that grows with it: nothing is known of either.
+            self.end()
+            return None
         if math.isnan(grown.by_zero):
             return None
         self._samples += 1
@@ -219,11 +225,14 @@ def _stepped(
     if not math.isnan(grown_um):
         residual_um = grown_um - estimate.y_um
         cost += _cost(residual_um, engine.measure_y(residual_um, variance_um2))
-    low, high = engine.model.validity.get("heat_w", (-math.inf, math.inf))
+    return cost + min(beyond_heat(engine.model, estimate) ** 2, _CLIP2), estimate
+
+
+def beyond_heat(model: ThermalModel, estimate: Estimate) -> float:
+    """Return by how many standard deviations an estimated heat is outside of what the model is valid for."""
+    low, high = model.validity.get("heat_w", (-math.inf, math.inf))
     beyond_w = max(low - estimate.heat_w, estimate.heat_w - high, 0.0)
-    if beyond_w > 0.0:
-        cost += min((beyond_w / estimate.heat_std_w) ** 2, _CLIP2)
-    return cost, estimate
+    return beyond_w / estimate.heat_std_w if beyond_w > 0.0 else 0.0
 
 
 def _cost(residual: float, variance: float) -> float:

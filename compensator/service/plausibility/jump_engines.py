@@ -11,6 +11,7 @@ from compensator.arrays import NAN
 from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
+from compensator.service.plausibility.hindsight import beyond_heat
 from compensator.service.plausibility.jump_state import Branch, ChannelJump, JumpState, Phase
 from compensator.service.plausibility.swapped import Ways, exchange_of, other_way_round, ways
 
@@ -26,8 +27,9 @@ _MOST_STEPS = 2
 _UNSTEADY = 2
 #: Samples for which AT may be on its way back from a jump within the permitted rate; slower moves are the air's.
 _MOST_MOVING = 3
-#: Samples for which exchanged channels may be neither the one nor the other way; the fewer before they are sure to be.
-_MOST_CHANGING = 10
+#: Samples for which exchanged channels may be neither the one nor the other way, as beside a door; fewer before they
+#: are sure to be.
+_MOST_CHANGING = 60
 #: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
 UNSEEN_SAMPLES = 2
 #: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
@@ -36,6 +38,8 @@ BRIDGED_SAMPLES = 480
 _CLIP = 5.0
 #: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
 _KEEP = 1.0 - 1.0 / 30.0
+#: Deviations from which on a heat outside of the range of validity cannot be.
+_BEYOND = 2.0
 #: Y speaks for an engine whose residual is within the first, and smaller than the other's by the second, in deviations
 #: of Y; for the shifted one also within the third part of the other's: how far a sensor jumped is not known exactly.
 _FITS, _CONTRADICTS, _FITS_PART = 3.0, 4.0, 0.1
@@ -337,6 +341,10 @@ class JumpEngines:
                     cost += sign * 2.0 * math.log(std)
         keep = _KEEP if state.is_suspect else 1.0
         state.ratio = keep * state.ratio + cost
+        believed = self.believing.estimate
+        if believed is not None and beyond_heat(self.believing.engine.model, believed) > _BEYOND:
+            # What agrees with a heat that cannot be does not agree.
+            state.ratio = min(state.ratio, 0.0)
 
     def swap(self) -> None:
         """Believe what the shifted engine expected: the other one is the doubt from here on."""
