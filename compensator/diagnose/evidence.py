@@ -108,7 +108,7 @@ class Evidence:
 
     @property
     def is_sparse(self) -> bool:
-        """Whether every run has Y measured now and then only, as by a touch probe."""
+        """Whether every run with Y has it measured now and then only, as by a touch probe."""
         return self.noise.freedom > 0
 
     @property
@@ -262,7 +262,9 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     ]
     residual = np.concatenate(parts)
     used = np.isfinite(residual)
-    names, sparse = ", ".join(dict.fromkeys(run.name for run in runs)), all(run.has_sparse_y for run in runs)
+    names = ", ".join(dict.fromkeys(run.name for run in runs))
+    # A part in which Y was never measured says nothing of how it is measured.
+    sparse = all(run.has_sparse_y for run in runs if np.isfinite(run.y_um).any())
     if used.sum() < (LEAST_VALUES if sparse else LEAST_SAMPLES):
         if sparse and used.any():
             raise DataError(f"{names}: y_um has {int(used.sum())} values, expected at least {LEAST_VALUES}")

@@ -94,6 +94,17 @@ def test_a_gain_is_named_from_47_hourly_probes(gain):
     assert gain.model.effects  # deployed: blocks of 16 values do not contradict by chance
 
 
+def test_a_part_without_a_probe_keeps_no_gain_from_being_named():
+    """A shift in which nobody probed: 29 probes are in the other part, fewer than samples would be wanted."""
+    columns = probed("gain DTF", 1)
+    parts = {name: np.split(values, [30 * 60]) for name, values in columns.items()}
+    first, second = ({name: values[i] for name, values in parts.items()} for i in (0, 1))
+    second["y_um"] = np.full(second["y_um"].size, np.nan)
+    with_it = tc.diagnose(QUILL, [first, second], y_std_um=STD_UM)
+    without = tc.diagnose(QUILL, [first], y_std_um=STD_UM)
+    assert with_it.verdict == without.verdict and with_it.verdict != "adequate"
+
+
 def test_tests_are_counted_in_probes(gain):
     tests = [test for rival in gain.effects[0].rivals if (test := rival.test)]
     assert tests
