@@ -29,6 +29,8 @@ from compensator.model.thermal_model import ThermalModel
 BRIDGE_SAMPLES = 60
 #: Step by which the growth of y with the paths is found, µm, and iterations of a correction by measured y.
 _SLOPE_UM, _ITERATIONS = 1.0, 6
+#: The paths move by no more than this many times a residual that effects make small.
+_MOST_MOVED = 5.0
 #: Samples within which a covariance is steady.
 _SETTLES_IN = 1500
 
@@ -425,8 +427,18 @@ class Engine:
             gain, _ = observer.gain_of_y(variance_um2, slopes)
             linear = slopes[0] * moved[0] + slopes[1] * moved[1]
             innovation = residual_um - (self._y_of(*now) - y_before) + linear
+        if effects and not self._leads_to(innovation, gain, residual_um, before):
+            return expected
         observer.measure_y(innovation, variance_um2, slopes)
         return expected
+
+    def _leads_to(
+        self, innovation: float, gain: Sequence[float], residual_um: float, before: tuple[float, float]
+    ) -> bool:
+        """Return whether a correction brings y nearer to the measured one, and does not go far beyond it."""
+        dtf, tdtf = (innovation * share for share in self._observer.shares_of(0, [*gain, 0.0]))
+        moved = self._y_of(before[0] + dtf, before[1] + tdtf) - self._y_of(*before)
+        return abs(residual_um - moved) <= abs(residual_um) and abs(dtf + tdtf) <= _MOST_MOVED * abs(residual_um)
 
     def _y_of(self, dtf: float, tdtf: float) -> float:
         """Return y with other shares of DTF and TDTF now, effects included, µm."""
@@ -443,8 +455,14 @@ class Engine:
 
     @property
     def takes_y(self) -> bool:
-        """Whether the state can be corrected by a measured deformation: it is not that of some samples before."""
-        return not isinstance(self._observer, LateObserver)
+        """Whether the state can be corrected by a measured deformation: it is not that of some samples before.
+
+        Nor does an effect remember what the paths have done: a correction would not reach that.
+        """
+        has_memory = any(
+            one.kind in ("hysteresis", "delay") and one.effect.lateness is None for one in self._parts[0].effects
+        )
+        return not (has_memory or isinstance(self._observer, LateObserver))
 
     def doubt(self, changes: Sequence[Sequence[float] | Vector]) -> None:
         """Doubt the state by what wrong temperatures may have made of it, and interpolate nothing over this time.

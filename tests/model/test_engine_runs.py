@@ -357,3 +357,16 @@ def test_measured_y_leads_the_state_to_it_also_where_an_effect_amplifies_it(chan
         other.measure_y(right.y_um - found.y_um, 0.01)
         assert abs(found.y_um) < 1000.0
     assert found.y_um == pytest.approx(right.y_um, abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "table", "takes"),
+    [
+        ("nonlinear", {"path": "DTF", "form": "cube", "change": 1.0}, True),
+        ("hysteresis", {"path": "DTF", "form": "play", "half_width_um": 5.0}, False),
+        ("delay", {"path": "TDTF", "delay_min": 6.0, "lag_min": 0.0}, False),
+    ],
+)
+def test_no_measured_y_corrects_what_an_effect_remembers(kind: str, table: dict[str, Any], takes: bool) -> None:
+    model = dataclasses.replace(QUILL, effects=(effect_from(kind, table),))
+    assert Engine(model).takes_y is takes

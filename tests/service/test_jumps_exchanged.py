@@ -93,6 +93,38 @@ def test_jumps_of_another_size_are_no_exchange(day: dict[str, np.ndarray], part:
     assert not is_wrong_in_ok(outcomes)
 
 
+@pytest.mark.parametrize(
+    ("channel", "size"), [("t_q_degc", -5.0), ("t_q_degc", 9.0), ("at_degc", 2.5), ("at_degc", -4.0)]
+)
+@pytest.mark.parametrize("after", [3, 60])
+def test_a_couple_that_is_pulled_meanwhile_is_not_believed_to_be_back(
+    day: dict[str, np.ndarray], channel: str, size: float, after: int
+) -> None:
+    """Its reading is not what is expected: an expectation that has become uncertain by that shows nothing."""
+    swap = exchanged(end=BEGIN + 80)
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values[channel] += size if i >= BEGIN + 80 - after else 0.0
+        swap(i, values)
+
+    outcomes = run(day, change)
+    assert not is_wrong_in_ok(outcomes)
+    asked = {f"{what}_channel:{channel}" for what in ("suspect", "unconfirmed")} | {"t_q_at_exchanged"}
+    assert all(asked & set(map(str, o.offset.reasons)) for o in outcomes[BEGIN + 80 :])
+
+
+@pytest.mark.parametrize("k", [-2.5, 1.5])
+def test_a_door_meanwhile_changes_nothing(day: dict[str, np.ndarray], k: float) -> None:
+    swap = exchanged()
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += k if BEGIN + 40 <= i < BEGIN + 55 else 0.0
+        swap(i, values)
+
+    outcomes = run(day, change)
+    assert np.max(np.abs(offsets(outcomes) - undisturbed())[END + BACK :]) < 5.0
+
+
 def test_the_end_of_an_exchange_that_nobody_noticed_is_none(day: dict[str, np.ndarray]) -> None:
     """Exchanged on the cold machine: what the state holds is wrong, and a person must say that they are right now."""
     outcomes = run(day, exchanged(begin=1))

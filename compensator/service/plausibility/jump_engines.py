@@ -13,7 +13,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.hindsight import beyond_heat
 from compensator.service.plausibility.jump_state import Branch, ChannelJump, JumpState, Phase
-from compensator.service.plausibility.swapped import Ways, exchange_of, other_way_round, ways
+from compensator.service.plausibility.swapped import Natural, Ways, exchange_of, other_way_round, ways, what_fits
 
 #: A value counts as expected within this number of standard deviations.
 NEAR = 4.0
@@ -240,10 +240,12 @@ class JumpEngines:
             Smallest jump that is looked for, K: from there on what is left of one after a return is another zero.
         """
         if state.may_be_exchanged:
-            exchanged = self._feed_exchanged(state, offered, change_k["t_q_degc"])
+            exchanged = self._feed_exchanged(
+                state, offered, Natural(least_k, change_k["t_q_degc"], change_k["at_degc"])
+            )
             if exchanged is not None:
                 return exchanged
-            state.exchanged = "no"
+            state.exchanged = "refuted"
         values: dict[str, float] = {}
         new: list[str] = []
         for name in TEMPERATURES:
@@ -266,8 +268,8 @@ class JumpEngines:
             if move in {_Move.JUMPS, _Move.GOES_ON}:
                 new.append(name)
                 _enter_jump(state, name, difference, std, goes_on=move == _Move.GOES_ON)
-        may_be_exchanged = new and not is_unsteady(state) and (state.age == 0 or not state.is_unconfirmed)
-        if may_be_exchanged and not any(map(math.isnan, offered.values())):
+        is_asked = state.exchanged == "no" and (state.age == 0 or not state.is_unconfirmed)
+        if new and is_asked and not is_unsteady(state) and not any(map(math.isnan, offered.values())):
             state.exchanged = exchange_of(self.shifted.engine, offered)
             # Beside AT that has jumped T_Q may look like one whose heat is switched off.
             for name in TEMPERATURES if state.may_be_exchanged else ():
@@ -278,16 +280,22 @@ class JumpEngines:
                 values[name] = NAN
         return Fed(values, new, state.exchanged == "yes")
 
-    def _feed_exchanged(self, state: JumpState, offered: Mapping[str, float], t_q_change_k: float) -> Fed | None:
+    def _feed_exchanged(self, state: JumpState, offered: Mapping[str, float], natural: Natural) -> Fed | None:
         """Return what the shifted engine is given of exchanged channels; None if they are no longer."""
-        is_missing = any(map(math.isnan, offered.values()))
-        found = ways(self.shifted.engine, offered, t_q_change_k) if not is_missing else Ways.NEITHER
+        is_missing, engine = any(map(math.isnan, offered.values())), self.shifted.engine
+        found = Ways.NEITHER if is_missing else ways(engine, offered, natural, is_doubtful=state.moving > 0)
         for jump in state.jumps.values():
             jump.back = jump.back + 1 if found == Ways.STRAIGHT else 0
         if found == Ways.NEITHER:
             state.moving += not is_missing
             most = _MOST_CHANGING if state.exchanged == "yes" else _MOST_MOVING
-            return Fed(dict.fromkeys(TEMPERATURES, NAN), []) if state.moving < most else None
+            if state.moving >= most:
+                return None
+            is_sure = not is_missing and state.exchanged == "yes"
+            return Fed(
+                what_fits(engine, offered, natural) if is_sure else dict.fromkeys(TEMPERATURES, NAN),
+                [],
+            )
         state.moving = 0
         is_straight = found in {Ways.STRAIGHT, Ways.RATHER_STRAIGHT}
         is_new = found == Ways.SWAPPED and state.exchanged == "perhaps"

@@ -66,17 +66,21 @@ class JumpSigns:
             found.append("at_degc")
         jumps = [t_q_degc - expected.t_q_k for expected in (with_at, without)]
         limits = [max(least_k, _JUMP * expected.t_q_std_k) for expected in (with_at, without)]
-        if all(abs(k) > most and not self._is_heat(engine.drive_for(k)) for k, most in zip(jumps, limits, strict=True)):
+        if all(
+            abs(k) > most and not is_heat(self._model, engine.drive_for(k))
+            for k, most in zip(jumps, limits, strict=True)
+        ):
             found.append("t_q_degc")
         return found
 
-    def _is_heat(self, heat_w: float) -> bool:
-        """Return whether there can be so much heat; a short burst of it looks like a jump for many minutes."""
-        if "heat_w" not in self._model.validity:
-            return True
-        low, high = self._model.validity["heat_w"]
-        beyond = _BEYOND * (high - low)
-        return low - beyond <= heat_w <= high + beyond
+
+def is_heat(model: ThermalModel, heat_w: float) -> bool:
+    """Return whether there can be so much heat; a short burst of it looks like a jump for many minutes."""
+    if "heat_w" not in model.validity:
+        return True
+    low, high = model.validity["heat_w"]
+    beyond = _BEYOND * (high - low)
+    return low - beyond <= heat_w <= high + beyond
 
 
 def jump_note(name: str, shift_k: float, then: str = "and is not used until its new value is confirmed") -> Note:

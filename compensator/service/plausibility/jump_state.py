@@ -18,7 +18,7 @@ from compensator.service.plausibility.hindsight import HindsightState
 FORGOTTEN_SAMPLES = 240
 
 
-Exchanged = Literal["no", "perhaps", "yes"]
+Exchanged = Literal["no", "perhaps", "yes", "refuted"]
 
 
 class Phase(StrEnum):
@@ -99,8 +99,9 @@ class JumpState(msgspec.Struct, kw_only=True):
         Samples since the last jump.
     ratio : float
         Log likelihood ratio of the believing over the shifted engine.
-    exchanged : {"no", "perhaps", "yes"}
-        Whether T_Q and AT read each other's temperature; perhaps: the last sample may be a mean of both ways.
+    exchanged : {"no", "perhaps", "yes", "refuted"}
+        Whether T_Q and AT read each other's temperature; perhaps: the last sample may be a mean of both ways; refuted:
+        what they read then was neither.
     moving : int
         Consecutive samples for which AT of `Phase.AIR`, or exchanged channels, have been on their way back.
     at_held : int
@@ -186,7 +187,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     @property
     def may_be_exchanged(self) -> bool:
         """Whether T_Q and AT may read each other's temperature."""
-        return self.exchanged != "no"
+        return self.exchanged in {"perhaps", "yes"}
 
     @property
     def is_watched(self) -> bool:
