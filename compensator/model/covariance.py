@@ -426,10 +426,13 @@ class Covariance:
         column, s = self._column_of_y(variance_um2, of_y)
         return (column / s).tolist(), s
 
-    def measure_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> None:
-        """Take a measured y, whose gain is that of `gain_of_y`."""
+    def measure_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> list[float]:
+        """Take a measured y, and return its gain, which is that of `gain_of_y`."""
         column, s = self._column_of_y(variance_um2, of_y)
-        self._replace(_corrected(self.p, column / s, column, s))
+        gain = column / s
+        self._replace(_corrected(self.p, gain, column, s))
+        found: list[float] = gain.tolist()
+        return found
 
     def _column_of_y(self, variance_um2: float, of_y: Sequence[tuple[int, float]]) -> tuple[Vector, float]:
         column = np.zeros(self.size)

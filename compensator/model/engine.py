@@ -416,42 +416,38 @@ class Engine:
             Variance of the value itself, µm².
         """
         observer, before = self._observer, self._observer.shares_of(0, self._observer.x)
-        y_before, slopes = self._y_of(*before), self._slopes_of_y(*before)
+        y_before, slopes = self._y_and_slopes(*before)
         gain, expected = observer.gain_of_y(variance_um2, slopes)
         innovation, effects = residual_um, self._parts[0].effects
         # Effects may amplify what the paths do: then the slopes are those where the correction leads to (iterated EKF).
         for _ in range(_ITERATIONS if effects else 0):
             moved = [innovation * share for share in observer.shares_of(0, [*gain, 0.0])]
             now = before[0] + moved[0], before[1] + moved[1]
-            slopes = self._slopes_of_y(*now)
+            y_now, slopes = self._y_and_slopes(*now)
             gain, _ = observer.gain_of_y(variance_um2, slopes)
             linear = slopes[0] * moved[0] + slopes[1] * moved[1]
-            innovation = residual_um - (self._y_of(*now) - y_before) + linear
-        if effects and not self._leads_to(innovation, gain, residual_um, before):
-            return expected
+            innovation = residual_um - (y_now - y_before) + linear
+        if effects:
+            dtf, tdtf = (innovation * share for share in observer.shares_of(0, [*gain, 0.0]))
+            moved_um = self._y_of(before[0] + dtf, before[1] + tdtf) - y_before
+            is_nearer = abs(residual_um - moved_um) <= abs(residual_um)
+            if not (is_nearer and abs(dtf + tdtf) <= _MOST_MOVED * abs(residual_um)):
+                return expected
         observer.measure_y(innovation, variance_um2, slopes)
         return expected
-
-    def _leads_to(
-        self, innovation: float, gain: Sequence[float], residual_um: float, before: tuple[float, float]
-    ) -> bool:
-        """Return whether a correction brings y nearer to the measured one, and does not go far beyond it."""
-        dtf, tdtf = (innovation * share for share in self._observer.shares_of(0, [*gain, 0.0]))
-        moved = self._y_of(before[0] + dtf, before[1] + tdtf) - self._y_of(*before)
-        return abs(residual_um - moved) <= abs(residual_um) and abs(dtf + tdtf) <= _MOST_MOVED * abs(residual_um)
 
     def _y_of(self, dtf: float, tdtf: float) -> float:
         """Return y with other shares of DTF and TDTF now, effects included, µm."""
         signals = self._signals(dtf, tdtf)
         return dtf + tdtf + math.fsum(effect.peek(signals) for effect in self._parts[0].effects)
 
-    def _slopes_of_y(self, dtf: float, tdtf: float) -> tuple[float, float]:
-        """Return by how much y changes with the shares of DTF and TDTF there."""
-        if not self._parts[0].effects:
-            return 1.0, 1.0
+    def _y_and_slopes(self, dtf: float, tdtf: float) -> tuple[float, tuple[float, float]]:
+        """Return y there, and by how much it changes with the shares of DTF and TDTF."""
         now = self._y_of(dtf, tdtf)
+        if not self._parts[0].effects:
+            return now, (1.0, 1.0)
         by_dtf, by_tdtf = self._y_of(dtf + _SLOPE_UM, tdtf) - now, self._y_of(dtf, tdtf + _SLOPE_UM) - now
-        return by_dtf / _SLOPE_UM, by_tdtf / _SLOPE_UM
+        return now, (by_dtf / _SLOPE_UM, by_tdtf / _SLOPE_UM)
 
     @property
     def takes_y(self) -> bool:

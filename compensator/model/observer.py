@@ -352,9 +352,7 @@ class Observer:
 
     def measure_y(self, residual_um: float, variance_um2: float, slopes: tuple[float, float]) -> None:
         """Correct the state by a measured y, whose gain is that of `gain_of_y`; the residual is measured − expected."""
-        gain, _ = self.gain_of_y(variance_um2, slopes)
-        self._covariance.measure_y(variance_um2, self._of_y(*slopes))
-        self._correct(gain, residual_um)
+        self._correct(self._covariance.measure_y(variance_um2, self._of_y(*slopes)), residual_um)
 
     def doubt(self, changes: Sequence[Sequence[float] | Vector]) -> None:
         """Widen the covariance by errors that the state may have, each one standard deviation of a change of it."""

@@ -12,11 +12,10 @@ from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.hindsight import beyond_heat
+from compensator.service.plausibility.jump_signs import NEAR
 from compensator.service.plausibility.jump_state import Branch, ChannelJump, JumpState, Phase
 from compensator.service.plausibility.swapped import Natural, Ways, exchange_of, other_way_round, ways, what_fits
 
-#: A value counts as expected within this number of standard deviations.
-NEAR = 4.0
 #: A returned value may differ by this part of the jump from the expected one, at most by the other part.
 _RETURNED, _RETURNED_MOST = 0.2, 0.5
 #: Consecutive samples for which a channel must be back; doubled by each further jump, up to the last number.

@@ -10,6 +10,8 @@ from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.guards import TEMPERATURES
 
+#: A value counts as expected within this number of standard deviations.
+NEAR = 4.0
 #: Heat beyond its range of validity by this part of the range cannot explain a jump of T_Q within the permitted rate.
 _BEYOND = 0.2
 #: Standard deviations of the innovation that such a jump exceeds in any case.

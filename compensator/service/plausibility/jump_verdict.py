@@ -10,7 +10,6 @@ import msgspec
 from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
 from compensator.service.plausibility.jump_engines import (
-    NEAR,
     JumpEngines,
     Run,
     expected_value,
@@ -22,6 +21,7 @@ from compensator.service.plausibility.jump_signs import (
     AIR,
     FITS,
     LEFT,
+    NEAR,
     RESTED,
     accepted_note,
     jump_note,

@@ -15,11 +15,9 @@ from enum import Enum
 from compensator.arrays import NAN
 from compensator.model.engine import Engine
 from compensator.model.observer import Forecast
-from compensator.service.plausibility.jump_signs import is_heat
+from compensator.service.plausibility.jump_signs import NEAR, is_heat
 from compensator.service.plausibility.jump_state import Exchanged
 
-#: A reading fits within so many standard deviations of what is expected.
-_NEAR = 4.0
 #: After readings that fitted neither way also within the smallest jump that is looked for, or this part of what the two
 #: temperatures differ by: what is uncertain because something else was wrong shows nothing.
 _PART = 0.2
@@ -66,7 +64,7 @@ class Natural:
 
     def may_be_heat(self, engine: Engine, k: float, std_k: float) -> bool:
         """Return whether T_Q may differ by so much from what is expected."""
-        return abs(k) <= _NEAR * std_k or (abs(k) <= self.t_q_change_k and is_heat(engine.model, engine.drive_for(k)))
+        return abs(k) <= NEAR * std_k or (abs(k) <= self.t_q_change_k and is_heat(engine.model, engine.drive_for(k)))
 
 
 def ways(engine: Engine, readings: Mapping[str, float], natural: Natural, *, is_doubtful: bool) -> Ways:
@@ -85,11 +83,11 @@ def ways(engine: Engine, readings: Mapping[str, float], natural: Natural, *, is_
     """
     expected = engine.forecast(NAN)
     most_k = natural.most_k(expected) if is_doubtful else math.inf
-    if _NEAR * expected.t_q_std_k > most_k:
+    if NEAR * expected.t_q_std_k > most_k:
         return Ways.NEITHER
     (at_k, t_q_k), cost = _differences(engine, readings)
     (at_swapped_k, t_q_swapped_k), swapped_cost = _differences(engine, other_way_round(readings))
-    near_k = max(min(_NEAR * expected.at_std_k, most_k), natural.air_k(expected))
+    near_k = max(min(NEAR * expected.at_std_k, most_k), natural.air_k(expected))
     is_straight = abs(at_k) <= near_k and natural.may_be_heat(engine, t_q_k, expected.t_q_std_k)
     is_swapped = abs(at_swapped_k) <= near_k and natural.may_be_heat(engine, t_q_swapped_k, expected.t_q_std_k)
     if not (is_straight or is_swapped):
@@ -111,15 +109,15 @@ def exchange_of(engine: Engine, readings: Mapping[str, float]) -> Exchanged:
     apart_k = expected.t_q_k - expected.at_k
     (at_k, t_q_k), swapped_cost = _differences(engine, other_way_round(readings))
     is_near = all(
-        abs(k) <= max(_NEAR * std, _FIRST_PART * apart_k)
+        abs(k) <= max(NEAR * std, _FIRST_PART * apart_k)
         for k, std in ((at_k, expected.at_std_k), (t_q_k, expected.t_q_std_k))
     )
     if is_near and _differences(engine, readings)[1] - swapped_cost > _SURE:
         return "yes"
     at_k, t_q_k = readings["at_degc"] - expected.at_k, readings["t_q_degc"] - expected.t_q_k
     is_between = 0.0 < at_k < apart_k
-    have_moved = abs(at_k) > _NEAR * expected.at_std_k and abs(t_q_k) > _NEAR * expected.t_q_std_k
-    is_even = abs(at_k + t_q_k) <= _NEAR * math.hypot(expected.at_std_k, expected.t_q_std_k)
+    have_moved = abs(at_k) > NEAR * expected.at_std_k and abs(t_q_k) > NEAR * expected.t_q_std_k
+    is_even = abs(at_k + t_q_k) <= NEAR * math.hypot(expected.at_std_k, expected.t_q_std_k)
     return "perhaps" if is_between and have_moved and is_even else "no"
 
 
@@ -131,11 +129,11 @@ def what_fits(engine: Engine, readings: Mapping[str, float], natural: Natural) -
     expected = engine.forecast(NAN)
     most_k = natural.most_k(expected)
     values, found = readings.values(), dict.fromkeys(_OTHER, NAN)
-    if _NEAR * expected.t_q_std_k <= most_k:
+    if NEAR * expected.t_q_std_k <= most_k:
         near = [v for v in values if natural.may_be_heat(engine, v - expected.t_q_k, expected.t_q_std_k)]
         if len(near) == 1:
             return found | {"t_q_degc": near[0]}
-    near = [value for value in values if abs(value - expected.at_k) <= _NEAR * expected.at_std_k <= most_k]
+    near = [value for value in values if abs(value - expected.at_k) <= NEAR * expected.at_std_k <= most_k]
     return found | {"at_degc": near[0]} if len(near) == 1 else found
 
 
