@@ -194,7 +194,7 @@ class Loop(_Table, frozen=True, kw_only=True):
 
     policy: Literal["off", "propose", "adopt"] = "off"
     at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "02:00"
-    every_h: Literal[4, 6, 8, 12, 24] = 12
+    every_h: Literal[4, 6, 8, 12, 24] = 6
     misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 3.0
     record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
     shadow_h: Annotated[float, Meta(ge=6, le=168)] = 6.0

@@ -266,6 +266,8 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
         Why the candidate cannot be used.
     needs : str
         What a person has to do.
+    y_drifted : bool
+        Whether measured Y has moved by itself: a drift or a step of it was named.
     from_utc_ns, to_utc_ns : int
         What was diagnosed, ns since 1970 UTC.
     seconds : float
@@ -282,6 +284,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     in_shadow: bool = False
     refused: str = ""
     needs: str = ""
+    y_drifted: bool = False
     from_utc_ns: int = 0
     to_utc_ns: int = 0
     seconds: float = 0.0
@@ -387,6 +390,7 @@ class Implausibility(StrEnum):
     JUMPED = "jumped"
     UNCONFIRMED = "unconfirmed"
     ACCEPTED = "accepted"
+    WAS_WRONG = "was_wrong"
 
 
 _AnyData = TypeVar("_AnyData", bound=_Data)

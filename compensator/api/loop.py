@@ -25,6 +25,9 @@ from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
+#: Effects by which measured Y moves to another level by itself.
+_OF_Y = ("drift", "step")
+
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
 #: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing.
@@ -174,7 +177,8 @@ def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> 
     before, after = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um
     text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
     extended = dump_model(found.model).encode() if effects else None
-    return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole))
+    y_drifted = any(effect.kind in _OF_Y for one in (found, whole) for effect in one.effects)
+    return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole), y_drifted)
 
 
 def _needs(found: DiagnosisResult) -> str:

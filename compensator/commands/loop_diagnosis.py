@@ -55,7 +55,13 @@ def _diagnose(job: Job, folder: Path) -> Result:
     found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
     found.save_all(folder)
     short = summarised(found, whole, model)
-    return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
+    return Result(
+        verdict=short.verdict,
+        effects=list(short.effects),
+        text=short.text,
+        needs=short.needs,
+        y_drifted=short.y_drifted,
+    )
 
 
 def take_priority() -> None:

@@ -16,6 +16,7 @@ from compensator.audit.result import RecordingAudit
 from compensator.config import Loop
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
+from compensator.service.loop import loop as loop_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
@@ -88,6 +89,27 @@ def test_such_a_candidate_is_adopted_after_a_zero():
     assert adopted - zero < DAY
     # The error about the zero is what remains of the effect.
     assert np.sqrt(np.mean((errors(steps)[adopted + 60 :] - np.mean(errors(steps)[zero + 1 : zero + 30])) ** 2)) < 3.0
+
+
+def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level():
+    """A diagnosis has named the drift: a candidate that follows it would be the better one about the zero, too."""
+    found = dataclasses.replace(shown(extended()), y_drifted=True)
+    samples = machine(3 * DAY)
+    loop = LoopRun(settings(), QUILL_FILE, Night(found, shown(extended())))
+    steps = run(loop, samples, 2000)
+    assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
+    loop.compensation.zero("warm")
+    steps += run(loop, samples, DAY)
+    assert "adopt" in [step for _, step, _ in decisions(steps)]
+
+
+def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):
+    wrong = 1600
+    monkeypatch.setattr(loop_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended()), shown(None, "adequate")))
+    steps = run(loop, machine(2 * DAY))
+    found = [(seq, step, why) for seq, step, why in decisions(steps) if step in ("shadow", "end", "adopt")]
+    assert [step for _, step, _ in found] == ["shadow", "end"] and found[1][::2] == (wrong, "was_wrong")
 
 
 class WarmAtFirst(Looping):

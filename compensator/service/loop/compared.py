@@ -41,6 +41,8 @@ class Compared:
         Errors of the present model.
     candidates : int
         Number of candidates in shadow: they share the chance to be found better by accident.
+    y_drifted : bool
+        Whether measured Y has moved by itself since the last zero: what is about the zero then shows no level.
     """
 
     def __init__(
@@ -51,9 +53,10 @@ class Compared:
         present_error: ErrorBlocks,
         *,
         candidates: int = 1,
+        y_drifted: bool = False,
     ) -> None:
         self._place, self._settings, self._present_error = place, settings, present_error
-        self._candidates = candidates
+        self._candidates, self._y_drifted = candidates, y_drifted
         self._period_s, self._comparison = period_s, Comparison(period_s, place.comparison)
 
     @property
@@ -164,11 +167,12 @@ class Compared:
 
         Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
         that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
-        which of them is seen at the next zero.
+        which of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right
+        level: what follows the mount is better, too.
         """
         shown_um, verdict = self.shown_level_um, self._place.verdict
         part = BETTER_PART if verdict.measured_by == "probe" else LEVEL_PART
-        if shown_um is None and is_better_about_zero(verdict, part):
+        if shown_um is None and not self._y_drifted and is_better_about_zero(verdict, part):
             return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um
 

@@ -52,6 +52,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     effects: list[str] = []
     text: str = ""
     needs: str = ""
+    y_drifted: bool = False
 
     def write(self, path: Path) -> None:
         """Write it atomically."""

@@ -37,9 +37,9 @@ from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
-from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted, is_disturbed, is_lost
+from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted, is_disturbed, is_lost, was_wrong
 from compensator.service.loop.words import begins, named, nothing_follows, surpassed
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN
 from compensator.service.transfer.second_opinion import described, is_unusable
 
@@ -92,7 +92,8 @@ class Loop:
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
         count = max(len(self.state.candidates), 1)
-        return Compared(place, self._settings, self._period_s, self.state.error, candidates=count)
+        state = self.state
+        return Compared(place, self._settings, self._period_s, state.error, candidates=count, y_drifted=state.y_drifted)
 
     # ------------------------------------------------------------------ one sample
 
@@ -120,7 +121,8 @@ class Loop:
         record_ns = round(self._settings.record_h * _HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         state.error.update(present)
-        notes: list[Note] = []
+        state.y_drifted = state.y_drifted and not sets_zero(present)
+        notes = self._forget_wrong() if was_wrong(present) else []
         judged: list[Place] = []
         for place in state.taken:
             compared, other = self.compared(place), others[place.sha256]
@@ -138,6 +140,15 @@ class Loop:
         if judged and not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
             notes += self._choose(judged, now_ns)
         return notes + self._schedule(now_ns)
+
+    def _forget_wrong(self) -> list[Note]:
+        """Let go what was found and compared while a temperature was wrong, and nobody knew."""
+        state, notes = self.state, end_diagnosis(self.state, "was_wrong")
+        for place in state.candidates:
+            notes += end(state, place, "was_wrong")
+        for place in state.taken:
+            place.begin_anew()
+        return notes
 
     # ------------------------------------------------------------------ decisions about a shadow
 
@@ -209,6 +220,7 @@ class Loop:
         if running is None or running.candidate_sha256:
             return []  # what another one has found is warmed up, or begins
         state.diagnosis = None
+        state.y_drifted = state.y_drifted or found.y_drifted
         why = why_nothing(state, self._settings, found, now_ns)
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)

@@ -25,6 +25,8 @@ DIFFERS = 1.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
 #: is diagnosed.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
+#: Newer parameters of its effects take the place of a candidate after so many times `shadow_h`: not all hours count.
+_YOUNG = 1.25
 _HOUR_NS = 3600 * NS
 
 
@@ -55,8 +57,8 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         return "avoided"
     before = with_effects(state, role, found.effects)
     if before is not None:
-        # What gave its place too often would never be compared for its own hours.
-        is_young = now_ns - before.since_utc_ns < settings.shadow_h * _HOUR_NS
+        # What gave its place too often would never be judged by its own hours.
+        is_young = now_ns - before.since_utc_ns < _YOUNG * settings.shadow_h * _HOUR_NS
         return "in_shadow" if is_young or is_asked(before, settings) else ""
     return "waits" if state.exchange else ""
 

@@ -133,6 +133,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         Effects of the present model.
     error : ErrorBlocks
         Errors of the present model since the last zero.
+    y_drifted : bool
+        Whether a diagnosis since then has found that measured Y had moved by itself.
     avoided : list of Avoided
         Models that were gone back from or dismissed.
     """
@@ -153,6 +155,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
+    y_drifted: bool = False
     avoided: list[Avoided] = []
 
     @property

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from compensator.codes import Reason
+from compensator.events import Implausibility
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.second_opinion import sensor_suspected
 
@@ -43,6 +44,11 @@ def is_contradicted(reasons: Sequence[str]) -> bool:
 def is_alarmed(reasons: Sequence[str]) -> bool:
     """Return whether measured and predicted Y diverge."""
     return any(reason.startswith(_ALARMS) for reason in reasons)
+
+
+def was_wrong(outcome: Outcome) -> bool:
+    """Return whether a sample has shown that a temperature was wrong before anything suspected it."""
+    return any(note.data.get("code") == Implausibility.WAS_WRONG for note in outcome.notes)
 
 
 def all_suspect_a_sensor(outcomes: Sequence[Outcome]) -> bool:

@@ -43,6 +43,8 @@ class Diagnosed:
         One sentence for people.
     needs : str
         What a person has to do.
+    y_drifted : bool
+        Whether measured Y has moved by itself.
     """
 
     verdict: str
@@ -50,6 +52,7 @@ class Diagnosed:
     model: bytes | None
     text: str
     needs: str = ""
+    y_drifted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,9 @@ def weigh(
 
 def without_candidate(found: Diagnosed) -> DiagnosisData:
     """Return the data of a diagnosis from which no candidate follows."""
-    return DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs)
+    return DiagnosisData(
+        verdict=found.verdict, effects=list(found.effects), needs=found.needs, y_drifted=found.y_drifted
+    )
 
 
 def effect_names(model: ThermalModel) -> list[str]:

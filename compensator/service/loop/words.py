@@ -58,6 +58,7 @@ def ended(why: str, verdict: ComparisonData = NO_VERDICT) -> str:
         "watched": f"the model before is no longer compared: {described(verdict)}",
         "dismissed": "the candidate is dismissed by an operator",
         "avoided": "the service goes back from the effects of the candidate",
+        "was_wrong": "a temperature was wrong while it was found or compared, as measured Y shows now",
         "replaced": "another model has replaced the present one",
         "interrupted": "the service was interrupted before it began",
     }[why]

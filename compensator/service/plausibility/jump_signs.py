@@ -94,12 +94,12 @@ def jump_note(name: str, shift_k: float, then: str = "and is not used until its 
     )
 
 
-def accepted_note(name: str, size_k: float, how: str) -> Note:
+def accepted_note(name: str, size_k: float, how: str, code: Implausibility = Implausibility.ACCEPTED) -> Note:
     """Return the event that a channel is used again."""
     return Note(
         EventKind.PLAUSIBILITY,
         f"{NAMES[name]} {how}",
-        {"code": Implausibility.ACCEPTED, "channel": name, "shift_k": size_k},
+        {"code": code, "channel": name, "shift_k": size_k},
     )
 
 

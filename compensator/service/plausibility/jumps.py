@@ -15,6 +15,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.config import Config
+from compensator.events import Implausibility
 from compensator.messages import ChannelSample, number
 from compensator.model.engine import Engine, EngineState, Estimate
 from compensator.model.thermal_model import ThermalModel
@@ -231,7 +232,10 @@ class JumpWatch:
         self._hindsight.end()
         self._learning = _LEARNING
         how = "is used again: measured Y shows that it was wrong before its jump of"
-        notes = [accepted_note(name, jumps_k[name], f"{how} {jumps_k[name]:+.2f} K") for name in suspects]
+        notes = [
+            accepted_note(name, jumps_k[name], f"{how} {jumps_k[name]:+.2f} K", Implausibility.WAS_WRONG)
+            for name in suspects
+        ]
         return Judgement(
             estimate, [*found.notes, *notes], found.accepted | {name: measured[name] for name in suspects}, found.zeros
         )
