@@ -84,7 +84,10 @@ def cleaned(name: str, records: Sequence[SampledRecord]) -> tuple[tuple[SampledR
                 continue
             slow = column.endswith(SLOW) and not is_sparse(values)
             row = IN_A_ROW if slow else 1
-            kept, count = without_outliers(values, first=slow and not is_switched, last=slow, in_a_row=row)
+            switches = not column.endswith(SLOW)
+            kept, count = without_outliers(
+                values, first=slow and not is_switched, last=slow, in_a_row=row, switches=switches
+            )
             if count:
                 remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {count} outlier(s) left out."))
             if column.endswith(SLOW) and (stand := stand_at_limit(kept)):
@@ -120,7 +123,7 @@ def refuse_at_limit(name: str, record: SampledRecord) -> None:
 
 
 def without_outliers(
-    values: Vector, *, first: bool = False, last: bool = False, in_a_row: int = 1
+    values: Vector, *, first: bool = False, last: bool = False, in_a_row: int = 1, switches: bool = False
 ) -> tuple[Vector, int]:
     """Replace outliers, readings far from all that is beside them, by NaN.
 
@@ -136,6 +139,9 @@ def without_outliers(
         Whether the first and last reading of each stretch without a long gap may be outliers, too.
     in_a_row : int
         Most outliers that follow each other, all on one side.
+    switches : bool
+        Whether the signal may be switched, within a sample, for one sample. Then a reading that is no farther out than
+        where the signal goes by itself elsewhere is no outlier.
 
     Examples
     --------
@@ -143,6 +149,10 @@ def without_outliers(
     >>> values[[0, 7]] = 9.0
     >>> without_outliers(values)[1], without_outliers(values, first=True)[1]
     (1, 2)
+    >>> flow = np.repeat([0.0, 12.0, 0.0, 12.0], 60)
+    >>> flow[[90, 100, 110]] = [0.0, 6.0, 99.0]
+    >>> without_outliers(flow)[1], without_outliers(flow, switches=True)[1]
+    (3, 1)
     """
     known = np.flatnonzero(~np.isnan(values))
     v = values[known]
@@ -161,6 +171,8 @@ def without_outliers(
         known = np.setdiff1d(known, outliers)
         ends = [end for end, asked in ((_first_alone, first), (_last_alone, last)) if asked]
         outliers = np.union1d(outliers, [at for end in ends for at in end(values, known, limit)]).astype(int)
+    if switches and outliers.size:
+        outliers = outliers[~_is_switched_to(values, outliers, limit)]
     if outliers.size == 0 or outliers.size > 0.02 * v.size:
         return values, 0
     kept = values.copy()
@@ -222,6 +234,34 @@ def _off_line(v: Vector, known: Indices, count: int, noise: float) -> Indices:
     apart = (np.minimum(distance, beyond) > limit) & (uneven < TOGETHER * limit)
     apart &= known[count + 3 :] - known[: -count - 3] == count + 3
     return np.asarray(known[(np.flatnonzero(apart)[:, None] + 2 + np.arange(count)).ravel()])
+
+
+def _is_switched_to(values: Vector, outliers: Indices, limit: float) -> Mask:
+    """Return which readings far from their neighbours are no farther out than the signal goes elsewhere.
+
+    That is the levels it jumps between and stays at, and all between them, where the mean of a sample lies in which it
+    was switched. A level that is only seen for single samples, as of a pump that lubricates for a minute, counts if the
+    very same value comes again, but not farther outside the other readings than these reach: a fault's code comes
+    again, too.
+    """
+    others = values.copy()
+    others[outliers] = np.nan
+    levels = [np.empty(0)]
+    for lag in (1, 2):  # two where a sample is the mean of both levels
+        before, after = others[:-lag], others[lag:]
+        jumps = np.abs(after - before) > limit
+        levels += [before[jumps], after[jumps]]
+    readings, low, high = np.sort(values[outliers]), float(np.nanmin(others)), float(np.nanmax(others))
+    again = readings[1:][np.diff(readings) <= SAME * np.maximum(1.0, np.abs(readings[1:]))]
+    # Of a signal that stands still but for these readings there is no measure of how far is too far.
+    reach = high - low if high > low else np.inf
+    levels.append(again[(again <= high + reach) & (again >= low - reach)])
+    known = np.concatenate(levels)
+    least, most = np.min(known, initial=np.inf) - limit, np.max(known, initial=-np.inf) + limit
+    kept = np.flatnonzero(~np.isnan(others))
+    beside = others[kept[np.minimum(np.searchsorted(kept, outliers), kept.size - 1)]]
+    out = values[outliers]
+    return np.asarray(np.where(out > beside, out <= most, out >= least))
 
 
 def _first_alone(values: Vector, known: Indices, limit: float) -> Iterator[int]:

@@ -106,6 +106,84 @@ def test_a_step_that_comes_again_and_one_that_was_computed_are_no_wrong_readings
     assert without_outliers(computed, first=True, last=True)[1] == 0
 
 
+def parts(seed=6):
+    """Return channels that are switched by design, in means of a minute: parts of an hour or so, then set-up.
+
+    At a change of parts the coolant, the spindle and the motor stop for less than a minute; a fan runs now and then.
+    """
+    rng = np.random.default_rng(seed)
+    on = np.zeros(6 * N)  # readings of 10 s
+    at = 0
+    while at < on.size:
+        for _ in range(rng.integers(3, 6)):
+            run = int(rng.integers(400, 600))
+            on[at : at + run] = 1.0
+            at += run + int(rng.integers(3, 8))
+        at += int(rng.integers(60, 200))
+    means = on.reshape(-1, 6).mean(axis=1)
+    fan = (np.arange(N) % 500 > 350).astype(float)
+    fan[[100, 600, 1200]] = 1.0
+    return {
+        "coolant_flow_lpm": 12.0 * means,
+        "spindle_rpm": 4500.0 * means,
+        "motor_load_pct": 80.0 * means * (1.0 + rng.normal(0.0, 0.02, N)),
+        "fan_on": fan,
+    }
+
+
+def wild_rows(column, values):
+    """Return the rows that are left out of a channel, and what is said."""
+    (record,), remarks = cleaned("day", [SampledRecord(np.arange(N) * 60.0, {column: values})])
+    return np.flatnonzero(np.isnan(record.columns[column])).tolist(), [remark.code for remark in remarks]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("column", parts())
+def test_a_channel_that_is_switched_for_a_minute_has_no_wrong_readings(column, seed):
+    assert wild_rows(column, parts(seed)[column]) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("coolant_flow_lpm", 40.0), ("spindle_rpm", 65535.0), ("motor_load_pct", 300.0), ("fan_on", 255.0)],
+)
+def test_a_wrong_reading_of_a_channel_that_is_switched_goes_alone(column, value):
+    """Neither the minutes of switching hide it, however many they are, nor does it take them with it."""
+    for row in (123, 777, 1350):
+        values = parts()[column]
+        values[row] = value
+        assert wild_rows(column, values) == ([row], ["wild_readings"])
+
+
+def test_a_level_is_where_a_channel_stays_or_comes_again():
+    pump = np.zeros(N)  # a pump that lubricates for a minute an hour has no other minutes to compare
+    pump[30::60] = 1.0
+    assert wild_rows("lubrication_on", pump) == ([], [])
+    once = np.zeros(N)
+    once[700] = 1.0
+    assert wild_rows("lubrication_on", once) == ([700], ["wild_readings"])
+    speed = np.repeat(np.tile([0.0, 3000.0, 6000.0], N // 300 + 1), 100)[:N]
+    tool = speed.copy()
+    tool[[150, 450, 750, 1050]] = 8000.0  # a tool of one minute in each part
+    assert wild_rows("spindle_rpm", tool) == ([], [])
+    fault = speed.copy()
+    fault[[150, 450, 750, 1050]] = 65535.0  # a code that comes again is farther out than all else reaches
+    assert wild_rows("spindle_rpm", fault) == ([150, 450, 750, 1050], ["wild_readings"])
+
+
+def test_what_does_not_switch_has_wrong_readings_within_its_range_too():
+    """A humidity drifts over a range; a coolant is let in colder all at once: heat goes nowhere for a minute."""
+    rng = np.random.default_rng(8)
+    drift = 50.0 + 10.0 * np.sin(np.arange(N) / 230.0)
+    humidity = drift + rng.normal(0.0, 0.1, N)
+    humidity[300] -= 12.0
+    assert wild_rows("humidity_pct", humidity) == ([300], ["wild_readings"])
+    for column in ("coolant_degc", "t_q_degc", "y_um"):
+        values = 20.0 + 40.0 * (np.arange(N) >= 900) + rng.normal(0.0, 0.03, N)
+        values[300] += 40.0
+        assert wild_rows(column, values) == ([300], ["wild_readings"])
+
+
 def clipped(limit=40.0, **changes):
     table = machine(**changes)
     table["t_q_degc"] = np.minimum(table["t_q_degc"], limit)
