@@ -91,13 +91,21 @@ class _Data(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         return table
 
 
+#: Begins what the text of a zero says against it.
+DOUBT = "; warning: "
+
+
 class ZeroData(_Data, frozen=True, kw_only=True):
-    """A zero that was set: on a machine at rest or a warm one, T_Q, AT (°C) and Y (µm) at that time."""
+    """A zero that was set: on a machine at rest or a warm one, T_Q, AT (°C) and Y (µm) at that time.
+
+    Where a rest was ordered and the model clearly contradicts it, `warm_um` is the deformation by stored heat, µm.
+    """
 
     mode: Literal["rest", "warm"]
     t_q_degc: float
     at_degc: float
     y_um: float | None
+    warm_um: float | None = None
 
 
 class PauseData(_Data, frozen=True, kw_only=True):
@@ -165,6 +173,8 @@ class NotJudged(StrEnum):
     NO_ZERO = "no_zero"
     NO_RECORD = "no_record"
     NO_Y = "no_y"
+    #: Nothing has been compared yet, for whatever reason.
+    NOT_YET = "not_yet"
     TOO_LITTLE = "too_little"
     SUSPECT = "suspect"
     UNRELATED = "unrelated"
@@ -180,7 +190,7 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     why : NotJudged, optional
         Why it could not be judged.
     remark : str
-        Why the recordings could not be replayed, in words.
+        Why the recordings could not be replayed, in words; or of what sensors are suspected while nothing is compared.
     measured_by : {"sensor", "probe", ""}
         What measured Y; empty if nothing did.
     hours : float
@@ -241,6 +251,10 @@ class LoopAction(StrEnum):
     BACK = "back"
     #: The comparison ends without another model.
     END = "end"
+    #: Nothing has been compared for long: a sensor is suspected under all models.
+    WAIT = "wait"
+    #: That is over.
+    WAIT_OVER = "wait_over"
 
 
 class DiagnosisData(_Data, frozen=True, kw_only=True):
@@ -308,11 +322,13 @@ class LoopData(_Data, frozen=True, kw_only=True):
     from_utc_ns, to_utc_ns : int
         What is diagnosed.
     since_utc_ns : int
-        When the comparison began.
+        When the comparison began, or since when nothing is compared.
     comparison : ComparisonData, optional
         The comparison at that time.
     level_um : float, optional
         By how much the level of the other model is raised at the exchange, µm (`Compensation.raise_level`).
+    reasons : list of str
+        Codes of what is suspected while nothing is compared.
     """
 
     step: LoopAction
@@ -325,6 +341,7 @@ class LoopData(_Data, frozen=True, kw_only=True):
     since_utc_ns: int = 0
     comparison: ComparisonData | None = None
     level_um: float | None = None
+    reasons: list[str] = []
 
 
 class RecordingCode(StrEnum):
@@ -424,10 +441,10 @@ def is_recorded(note: Note, event: Event) -> bool:
     """Return whether a recorded event agrees with a note.
 
     Version 0.1.0 recorded zeros and implausibilities without data: for those the texts are compared, so these two
-    kinds of note keep the wording of that version.
+    kinds of note keep the wording of that version. It did not doubt a zero at rest: what is said of that is left out.
     """
     if event.kind != note.kind:
         return False
     if not event.data:
-        return event.text == note.text
+        return event.text == note.text.partition(DOUBT)[0]
     return msgspec.json.encode(event.data) == msgspec.json.encode(note.data)

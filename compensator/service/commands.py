@@ -12,9 +12,9 @@ import msgspec
 from compensator.clock import Clock
 from compensator.codes import ProbeCode
 from compensator.errors import ServiceError
-from compensator.events import CommandName, EventKind
+from compensator.events import DOUBT, CommandName, EventKind
 from compensator.messages import UNREADABLE, Probe
-from compensator.service.compensation import Compensation
+from compensator.service.compensation import Compensation, doubt_of_rest
 from compensator.service.event_log import EventLog
 from compensator.service.loop.live import LiveLoop
 from compensator.service.probing import ReceivedProbe, read_probe
@@ -121,8 +121,10 @@ class Commands:
             if loop is not None:
                 loop.call_soon_threadsafe(self._note_refusal, name, str(error), sender)
             return refusal(str(error))
+        warm_um = self._running().warm_um if arguments.get("mode") == "rest" else None
         loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
-        return {"ok": True, "text": f"{name}: acts at the next sample"}
+        warning = f"{DOUBT}{doubt_of_rest(warm_um)}" if warm_um is not None else ""
+        return {"ok": True, "text": f"{name}: acts at the next sample{warning}"}
 
     def apply(self, compensation: Compensation) -> None:
         """Apply the commands that arrived since the last sample."""

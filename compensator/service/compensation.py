@@ -16,7 +16,7 @@ from compensator.axes import FIRST
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import ModelError
-from compensator.events import EventKind, Note, ZeroData
+from compensator.events import DOUBT, EventKind, Note, ZeroData
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.messages_axes import AxisOffset
 from compensator.model.engine import Estimate
@@ -42,6 +42,9 @@ __all__ = ["Compensation", "Outcome", "model_of", "slowest_min"]
 
 #: Number of samples over which rate and heat are averaged before they are used in a decision.
 MEAN_SAMPLES = 5
+#: A machine is clearly not at rest if the model ascribes more deformation to stored heat than so many of its standard
+#: deviations, and than a thermocouple makes that was replaced or has drifted, µm: then a zero at rest is right.
+_WARM_DEVIATIONS, _WARM_UM = 4.0, 5.0
 
 
 class Compensation(Continuity):
@@ -58,9 +61,27 @@ class Compensation(Continuity):
             `rest`: the machine is in thermal equilibrium; temperatures and deformation are zeroed.
             `warm`: it is not; only the deformation is zeroed, and the stored heat stays in the state.
             `auto`: `rest` if the predicted growth is below the configured rate, else `warm`.
+
+        Notes
+        -----
+        `rest` is obeyed where the model contradicts it, with a warning (`doubt_of_rest`): a person may know better, of
+        a thermocouple that was replaced for instance.
         """
         self._release(new_zero=True)
         self._zero.wanted, self._zero.mode = True, mode
+
+    @property
+    def warm_um(self) -> float | None:
+        """Deformation by stored heat after the last sample, µm, if the machine is clearly not at rest; else None."""
+        # One reference, which is replaced as a whole: commands ask on other threads.
+        memory, checks, estimate = self._memory, self.plausibility, self._memory.estimate
+        # Without a known state, or while the temperatures contradict each other, the model knows nothing of heat.
+        if estimate is None or memory.cold_min > 0.0 or checks.exchanged or checks.state.apart:
+            return None
+        least_um = max(_WARM_DEVIATIONS * estimate.y_std_um, _WARM_UM)
+        # Less than no heat is no warm machine: the zero before was none at rest, or a thermocouple is wrong.
+        gain, _ = self.model.dtf.gain_with_std()
+        return estimate.y_dtf_um if math.copysign(1.0, gain) * estimate.y_dtf_um > least_um else None
 
     def hold(self) -> None:
         """Freeze the offset until `resume`."""
@@ -267,6 +288,7 @@ class Compensation(Continuity):
         if not zero.wanted or math.isnan(values.t_q) or math.isnan(values.at):
             return
         warm = self._engine.has_reference and self._is_warm(zero.mode)
+        warm_um = self.warm_um if zero.mode == "rest" else None
         if warm:
             # The state is that of the last sample; the growth since then counts after the zero.
             zero.y_base = self._memory.estimate.y_um if self._memory.estimate else 0.0
@@ -286,7 +308,10 @@ class Compensation(Continuity):
             f"zero on a {'warm machine' if warm else 'machine at rest'}: T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C"
         )
         text += ", Y not measured" if math.isnan(values.y) else f", Y {values.y:.3f} µm"
-        data = ZeroData(mode="warm" if warm else "rest", t_q_degc=values.t_q, at_degc=values.at, y_um=values.y)
+        text += f"{DOUBT}{doubt_of_rest(warm_um)}" if warm_um is not None else ""
+        data = ZeroData(
+            mode="warm" if warm else "rest", t_q_degc=values.t_q, at_degc=values.at, y_um=values.y, warm_um=warm_um
+        )
         notes.append(Note(EventKind.ZERO, text, data.table()))
 
     def _is_warm(self, mode: ZeroMode) -> bool:
@@ -296,6 +321,14 @@ class Compensation(Continuity):
         heated = abs(mean(self._memory.heats)) > HEATED_W
         largest = max(abs(mean(self._memory.rates)), self.outputs.largest_rate_um_per_min())
         return heated or largest > self._config.zero.rest_rate_um_per_min
+
+
+def doubt_of_rest(warm_um: float) -> str:
+    """Return what speaks against a zero at rest, and what to do, in words."""
+    return (
+        f"by the model the machine is not at rest, {warm_um:+.1f} µm of Y are from stored heat; if that is so, the "
+        "offset is wrong by up to as much while it cools: set the zero at rest again when it has"
+    )
 
 
 def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:

@@ -214,6 +214,28 @@ async def test_commands_hold_resume_zero(bench: Bench) -> None:
     assert np.std([number(o.estimate.residual_um) for o in settled]) < 0.7
 
 
+async def test_a_zero_at_rest_on_a_warm_machine_is_obeyed_with_a_warning(bench: Bench) -> None:
+    """Afterwards the model sees less than no heat: what it says of the next zero at rest is no doubt."""
+    answers: dict[int, str] = {}
+
+    def send(sample: int, mode: str) -> None:
+        payload = f'{{"mode": "{mode}"}}'.encode()
+        bench.at_sample[sample] = lambda: answers.__setitem__(sample, bench.daemon.command("zero", payload)["text"])
+
+    for sample, mode in ((5, "rest"), (100, "warm"), (110, "rest"), (170, "rest")):
+        send(sample, mode)
+    await bench.run(175)
+    notes = (note for outcome in bench.outcomes for note in outcome.notes if note.kind == "zero")
+    _, cold, _, doubted, right = notes
+    assert {answers[sample] for sample in (5, 100, 170)} == {"zero: acts at the next sample"}
+    assert number(bench.outcomes[169].estimate.y_dtf_um) < -10.0
+    assert not any("warning" in note.text or "warm_um" in note.data for note in (cold, right))
+    assert doubted.data["mode"] == "rest" and doubted.data["warm_um"] > 20.0
+    figure = f"{doubted.data['warm_um']:+.1f} µm of Y are from stored heat"
+    assert doubted.text.startswith("zero on a machine at rest: ") and "warning: by the model" in doubted.text
+    assert figure in doubted.text and figure in answers[110]
+
+
 @pytest.mark.parametrize(
     ("name", "payload"),
     [("zero", b"{"), ("zero", b'{"mode":"hot"}'), ("zero", b"[1]"), ("dance", b""), ("hold", b"\xff\xfe")],

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from compensator.events import (
+    DOUBT,
     EventKind,
     Note,
     PauseData,
@@ -55,6 +56,9 @@ def test_a_note_is_recorded_by_its_data_and_in_version_0_1_0_by_its_text() -> No
     assert not is_recorded(note, event("zero", note.text, **{**zero, "t_q_degc": 20.5}))
     assert is_recorded(note, event("zero", note.text)) and not is_recorded(note, event("zero", "in other words"))
     assert not is_recorded(note, event("plausibility", note.text))
+    # It did not doubt a zero at rest.
+    doubted = Note(EventKind.ZERO, f"{note.text}{DOUBT}the machine is warm", zero | {"warm_um": 60.0})
+    assert is_recorded(doubted, event("zero", note.text)) and not is_recorded(doubted, event("zero", **zero))
 
 
 def test_the_name_of_a_command() -> None:

@@ -18,7 +18,9 @@ from compensator.events import DiagnosisData
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Place, decode_loop
+from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
+from compensator.service.transfer.second_opinion import described
 
 #: A planned diagnosis is 8 h later.
 BEGIN_NS = 1_767_592_800 * NS
@@ -91,7 +93,7 @@ def test_what_is_better_is_adopted_once_its_hours_show_it() -> None:
 def test_models_that_all_err_are_diagnosed_while_nothing_is_decided() -> None:
     with_one = list(decided(loop_of(watched=place("b", "before")), 30, after(121), {"b": after(121)}))
     alone = list(decided(loop_of(), 30, after(121), {}))
-    assert with_one == alone and {one.step for one in with_one} == {"diagnose"}
+    assert [one for one in with_one if one.step != "wait"] == alone and {one.step for one in alone} == {"diagnose"}
     assert with_one[0] == Decided(5.0, "diagnose", "misfit")
 
 
@@ -101,6 +103,60 @@ def test_a_newcomer_without_an_alarm_lets_no_older_models_judge_that_have_one() 
     assert [(one.step, one.why) for one in notes if one.step != "diagnose"] == [("adopt", "")]
     assert loop.state.incoming[0] == "n"
     assert loop.state.found[0].comparison.first_ns == 0 < loop.state.found[1].comparison.first_ns
+
+
+def waited(loop: Loop, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:
+    """Run a loop whose models have the same alarms; return what it says of waiting: when, step and text."""
+    said, noise = [], np.random.default_rng(1)
+    for minute in range(60 * hours.start + 1, 60 * hours.stop + 1):
+        own, other = map(float, noise.normal(0.0, 0.4, 2))
+        known = {one.sha256: outcome(minute, other, own, reasons(minute)) for one in loop.state.taken}
+        notes = loop.step(outcome(minute, own, own, reasons(minute)), known)
+        said += [(minute / 60.0, note.data["step"], note.text) for note in notes if note.data["step"][:4] == "wait"]
+        loop.state.diagnosis = None
+    return said
+
+
+def test_that_nothing_is_compared_for_long_is_said_once_and_so_is_its_end() -> None:
+    """The alarm comes and goes: what is compared for some minutes is forgotten again."""
+
+    def alarmed(minute: int) -> Sequence[str]:
+        return SUSPECT if 120 <= minute < 900 and minute % 100 > 5 else ()
+
+    loop = loop_of(place("a"), place("b"))
+    (begun, step, text), (over, step_over, text_over) = waited(loop, range(24), alarmed)
+    assert (step, step_over) == ("wait", "wait_over")
+    assert 8.0 < begun < 8.5 and over == pytest.approx((899 + 30) / 60.0, abs=0.02)
+    assert text == (
+        "nothing is compared: implausible:t_q_degc under all models since 2026-01-05 08:00 UTC; check these sensors, "
+        "then set a zero"
+    )
+    assert text_over == "models are compared again: no sensor is suspected under all of them any longer"
+    assert waited(loop_of(place("a")), range(24), lambda minute: SUSPECT if minute < 300 else ()) == []
+
+
+def test_what_it_waits_for_goes_on_after_a_restart_and_ends_with_what_waits() -> None:
+    whole, first = loop_of(place("a")), loop_of(place("a"))
+    assert waited(first, range(3), after(0)) == []
+    again = loop_of()
+    again.state = decode_loop(msgspec.json.encode(first.state))
+    (said,) = waited(whole, range(8), after(0))
+    assert waited(again, range(3, 8), after(0)) == [said]
+    again.give_up("by_hand", "ended")
+    ((_, step, text),) = waited(again, range(8, 9), after(0))
+    assert (step, text) == ("wait_over", "no model waits any longer to be compared")
+
+
+def test_a_candidate_that_was_never_compared_says_why() -> None:
+    loop = loop_of(place("a"))
+    assert described(loop.state.found[0].verdict) == "no verdict: nothing has been compared yet"
+    waited(loop, range(1), after(0, ("implausible:t_q_degc", "implausible:y_um")))
+    (waits,) = loop.state.found
+    why = "nothing is compared while a sensor is suspected under both models (implausible:t_q_degc, implausible:y_um)"
+    assert described(waits.verdict) == f"no verdict: {why}"
+    assert ended("gives_way", waits.verdict).endswith(f"promises least: no verdict: {why}")
+    waited(loop, range(1, 2), never)
+    assert "suspected" not in described(waits.verdict) and waits.verdict.samples > 0
 
 
 def test_what_was_compared_before_both_models_had_an_alarm_is_forgotten() -> None:

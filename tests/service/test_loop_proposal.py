@@ -12,7 +12,7 @@ from compensator.service.transfer.comparison import DEVIATIONS
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
 from tests.service.test_loop_run import CHECKED, NIGHT
-from tests.service.test_loop_service import Looping, checked, in_phase
+from tests.service.test_loop_service import Asked, Looping, checked, in_phase
 from tests.service.test_restart import QUILL
 
 #: What is compared counts for a day at least: so long after the effect has become smaller nothing else is left of it.
@@ -122,3 +122,23 @@ def test_a_proposal_stays_beside_others_of_later_diagnoses_until_nobody_has_answ
     after = found[found.index(("propose", "")) + 1 :]
     until = after.index(("end", "no_answer"))
     assert ("shadow", "") in after[:until] and not {step for step, _ in after[:until]} & {"propose", "withdraw"}
+
+
+async def test_that_nothing_is_compared_is_recorded_and_replayed(tmp_path: Path) -> None:
+    """T_Q drifts under all models for longer than the comparison lasts; then the couple is put right, and zero set."""
+    service = Looping(tmp_path, shown(extended()), policy="propose")
+    checks = b"[plausibility]\nfalse_alarm_days = 30.0\nresidual_std_um = 0.6\nresidual_correlation_min = 30.0\n"
+    service.use(service.config_bytes + checks)
+    t_q, ends = service.device.sources[0], list[int]()
+    service.device.sources[0] = lambda: t_q() + (0.02 * max(service.minute() - 240, 0) if not ends else 0.0)
+
+    await service.run(1500, until=lambda _: "wait" in dict(service.steps()))
+    (text,) = (event.text for event in service.events("loop") if event.data["step"] == "wait")
+    assert text.startswith("nothing is compared: ") and "implausible" in text and " under all models since " in text
+    ends.append(service.minute())
+    service.at_sample[len(service.outcomes) + 60] = Asked(service, "zero")
+    await service.run(400, until=lambda _: "wait_over" in dict(service.steps()))
+    await service.run_and_kill(20)
+    found = [step for step, _ in service.steps()]
+    assert found.count("wait") == found.count("wait_over") == 1
+    checked(service)

@@ -15,8 +15,10 @@ import pytest
 
 from compensator.audit.series import audit
 from compensator.config import parse_config
+from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.model.model_file import parse_model
 from compensator.recording.reading import messages, recordings
+from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.second_opinion import described, second_opinion
 from tests.audit.made import CONFIG
@@ -178,6 +180,26 @@ async def test_a_sensor_that_was_moved_refuses_no_better_model(tmp_path: Path, m
         odd.append(machine.opinion(QUILL, other))
         assert odd[-1].verdict == "worse"
     assert any(found.y_moved and "about the zero it looks otherwise" in described(found) for found in odd)
+
+
+def test_where_y_has_moved_the_figures_of_the_verdict_come_first() -> None:
+    """The errors about the zero say the contrary, which must not read as the reason."""
+    found = ComparisonData(
+        verdict=ComparisonVerdict.WORSE,
+        hours=12.0,
+        present_rms_um=0.8,
+        candidate_rms_um=0.5,
+        deviations=-5.1,
+        ratio=1.4,
+        y_moved=True,
+    )
+    text = (
+        "last 12 h: by the changes of measured Y this one is worse than the present one (its error changes 1.4 times "
+        "as much; it is refuted by 5 standard deviations); about the zero it looks otherwise (present 0.8 µm rms, "
+        "this one 0.5)"
+    )
+    assert described(found) == text
+    assert "(it is refuted" in described(changed(found, ratio=None))
 
 
 @pytest.mark.parametrize("noise_um", [0.0, 0.3])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
-from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
@@ -16,11 +18,11 @@ from compensator.service.loop.proof import (
     is_enough,
     shared,
 )
-from compensator.service.loop.state import Place
+from compensator.service.loop.state import NO_VERDICT, Place
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
-from compensator.service.transfer.comparison import Comparison
+from compensator.service.transfer.comparison import Comparison, changed
 from compensator.service.transfer.second_opinion import is_unusable
 
 _HOUR_NS = 3600 * NS
@@ -68,6 +70,8 @@ class Compared:
         """Add a sample, unless it must not judge; return whether the verdict was made anew."""
         self._place.error.update(other)
         found = self._comparison
+        if self._place.verdict.why == NotJudged.SUSPECT:
+            self._place.verdict = NO_VERDICT  # no longer
         if sets_zero(present):
             found.set_zero()
         reasons = [*present.offset.reasons, *other.offset.reasons]
@@ -98,14 +102,18 @@ class Compared:
             own = self._comparison.of_itself().verdict(deviations=wanted)
             shows_more = own.deviations is not None and own.deviations > place.shows
             place.verdict = own if shows_more else place.verdict
+        if place.verdict.why == NotJudged.NO_Y:
+            place.verdict = changed(place.verdict, why=NotJudged.NOT_YET)  # Y may be there: nothing of it counts yet
 
-    def add_suspected(self, other: Outcome) -> bool:
+    def add_suspected(self, other: Outcome, suspects: Sequence[str] = ()) -> bool:
         """Begin anew, and return whether something was compared: the sensor was wrong before it was suspected."""
-        self._place.error.update(other)
-        if not self._place.comparison.first_ns:
-            return False
-        self._place.begin_anew()
-        return True
+        place = self._place
+        place.error.update(other)
+        was_compared = bool(place.comparison.first_ns)
+        if was_compared:
+            place.begin_anew()
+        place.verdict = changed(NO_VERDICT, why=NotJudged.SUSPECT, remark=", ".join(suspects))
+        return was_compared
 
     def is_better(self, now_ns: int) -> bool:
         """Return whether a candidate has shown enough, and in its own hours, too."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import msgspec
 
 from compensator.clock import NS
+from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, LoopAction, Note
@@ -38,7 +39,7 @@ from compensator.service.loop.schedule import begin_again, begin_if_due, forget_
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
 from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted, is_disturbed, is_lost, was_wrong
-from compensator.service.loop.words import begins, named, nothing_follows, surpassed
+from compensator.service.loop.words import begins, named, nothing_follows, surpassed, wait_over, waits
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN
 from compensator.service.transfer.second_opinion import described, is_unusable
@@ -123,6 +124,7 @@ class Loop:
         state.error.update(present)
         state.y_drifted = state.y_drifted and not sets_zero(present)
         notes = self._forget_wrong() if was_wrong(present) else []
+        notes += self._wait(present, others, is_suspected=suspected)
         judged: list[Place] = []
         for place in state.taken:
             compared, other = self.compared(place), others[place.sha256]
@@ -131,7 +133,7 @@ class Loop:
             # A newcomer that no sensor speaks against says nothing of two older models that both suspect one.
             if not (contradicted or all_suspect_a_sensor([present, other])):
                 judged += [place] if compared.add(present, other) else []
-            elif compared.add_suspected(other) and place.is_proposed and not state.exchange:
+            elif compared.add_suspected(other, _suspects(present, other)) and place.is_proposed and not state.exchange:
                 notes += withdraw(self.state, place, "a sensor is suspected, so what was compared does not count")
         for place in state.taken:
             # Until what is warmed up has its place, before the next sample, nothing that was found decides.
@@ -148,6 +150,22 @@ class Loop:
             notes += end(state, place, "was_wrong")
         for place in state.taken:
             place.begin_anew()
+        return notes
+
+    def _wait(self, present: Outcome, others: Mapping[str, Outcome], *, is_suspected: bool) -> list[Note]:
+        """Say that nothing is compared because all models suspect a sensor, once for `shadow_h`, and when it is over.
+
+        It is over when decisions are made again: a suspicion that comes and goes lets nothing be compared either.
+        """
+        state, before_min, longest_min = self.state, self.state.uncompared_min, 60.0 * self._settings.shadow_h
+        state.uncompared_ns = min(state.uncompared_ns, present.sample.time_utc_ns)
+        if others and (is_suspected or (before_min and state.clean_min < CLEAN_MIN)):
+            state.uncompared_ns = state.uncompared_ns or present.sample.time_utc_ns
+            state.uncompared_min += self._period_s / 60.0 if is_suspected else 0.0
+            is_said = before_min <= longest_min < state.uncompared_min
+            return [waits(state.uncompared_ns, _suspects(present, *others.values()))] if is_said else []
+        notes = [wait_over(state.uncompared_ns, is_compared=bool(others))] if before_min > longest_min else []
+        state.uncompared_min, state.uncompared_ns = 0.0, 0
         return notes
 
     # ------------------------------------------------------------------ decisions about a shadow
@@ -348,6 +366,13 @@ class Loop:
 
 def _named(place: Place) -> str:
     return f"{place.sha256[:12]} with {named(place.effects)}"
+
+
+def _suspects(*outcomes: Outcome) -> list[str]:
+    """Return for what reasons a sensor is suspected, each once."""
+    codes = (Reason.IMPLAUSIBLE, Reason.RESIDUAL_TOO_LARGE, Reason.T_Q_AT_APART, Reason.T_Q_AT_EXCHANGED)
+    reasons = (reason for outcome in outcomes for reason in outcome.offset.reasons)
+    return list(dict.fromkeys(one for one in reasons if one.startswith(codes)))
 
 
 def _counted(before_min: float, present: Outcome, minutes: float, *, suspected: bool) -> float:

@@ -19,7 +19,7 @@ STATE_SCHEMA = 3
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
 #: Before the first value.
-NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NO_Y)
+NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NOT_YET)
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,6 +123,10 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     clean_min, usable_min : float
         For how long no sensor has been suspected, and no sensor has shown a fault by itself, as far as that is counted,
         min: decisions wait for the first, diagnoses for the second.
+    uncompared_min : float
+        For how long nothing has been compared because all models that run suspect a sensor, min.
+    uncompared_ns : int
+        Since when, ns since 1970 UTC.
     found : list of Place
         What diagnoses have found: candidates, and the calibrated model.
     watched : Place, optional
@@ -150,6 +154,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     probes_shown: list[tuple[int, float]] = []
     clean_min: float = 0.0
     usable_min: float = 0.0
+    uncompared_min: float = 0.0
+    uncompared_ns: int = 0
     found: list[Place] = []
     watched: Place | None = None
     adopted_utc_ns: int = 0

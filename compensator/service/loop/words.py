@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
+from compensator.clock import NS
 from compensator.events import ComparisonData, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.place import role_of
 from compensator.service.loop.state import NO_VERDICT
@@ -62,6 +64,28 @@ def ended(why: str, verdict: ComparisonData = NO_VERDICT) -> str:
         "replaced": "another model has replaced the present one",
         "interrupted": "the service was interrupted before it began",
     }[why]
+
+
+def waits(since_utc_ns: int, suspects: Sequence[str]) -> Note:
+    """Say that nothing is compared, since when, and what is suspected."""
+    since = datetime.fromtimestamp(since_utc_ns // NS, UTC)
+    text = (
+        f"nothing is compared: {', '.join(suspects)} under all models since {since:%Y-%m-%d %H:%M} UTC; check these "
+        "sensors, then set a zero"
+    )
+    data = LoopData(step=LoopAction.WAIT, why="suspected", since_utc_ns=since_utc_ns, reasons=list(suspects))
+    return Note(EventKind.LOOP, text, data.table())
+
+
+def wait_over(since_utc_ns: int, *, is_compared: bool) -> Note:
+    """Say that what `waits` said is over."""
+    text = (
+        "models are compared again: no sensor is suspected under all of them any longer"
+        if is_compared
+        else "no model waits any longer to be compared"
+    )
+    data = LoopData(step=LoopAction.WAIT_OVER, why="" if is_compared else "ended", since_utc_ns=since_utc_ns)
+    return Note(EventKind.LOOP, text, data.table())
 
 
 def nothing_follows(why: str, found: DiagnosisData) -> Note:

@@ -106,19 +106,23 @@ def _described(found: ComparisonData) -> str:
     if found.present_rms_um is None or found.candidate_rms_um is None:
         return "; ".join(filter(None, (f"no verdict: {_why(found)}", moves)))
     probes = f", {found.probes} probe(s)" if found.measured_by == "probe" else ""
-    text = (
-        f"last {found.hours:.3g} h{probes}: present {found.present_rms_um:.1f} µm rms, "
-        f"this one {found.candidate_rms_um:.1f}"
-    )
+    rms = f"present {found.present_rms_um:.1f} µm rms, this one {found.candidate_rms_um:.1f}"
     if found.why is not None:
-        text += f" (no verdict: {_why(found)})"
+        text = f"{rms} (no verdict: {_why(found)})"
     elif found.verdict == ComparisonVerdict.ALIKE or found.deviations is None:
-        text += " (no clear difference)"
+        text = f"{rms} (no clear difference)"
     else:
-        moved = "about the zero it looks otherwise; by the changes of measured Y, this one is " if found.y_moved else ""
         refuted = "the present one" if found.verdict == ComparisonVerdict.BETTER else "it"
-        text += f" ({moved}{found.verdict}: {refuted} is refuted by {abs(found.deviations):.0f} standard deviations)"
-    return "; ".join(filter(None, (text, moves)))
+        shown = f"{refuted} is refuted by {abs(found.deviations):.0f} standard deviations"
+        text = f"{rms} ({found.verdict}: {shown})"
+        if found.y_moved:
+            # Its figures are not those of the verdict, and come last.
+            times = f"its error changes {found.ratio:.2g} times as much; " if found.ratio is not None else ""
+            text = (
+                f"by the changes of measured Y this one is {found.verdict} than the present one ({times}{shown}); "
+                f"about the zero it looks otherwise ({rms})"
+            )
+    return "; ".join(filter(None, (f"last {found.hours:.3g} h{probes}: {text}", moves)))
 
 
 def _why(found: ComparisonData) -> str:
@@ -130,8 +134,13 @@ def _why(found: ComparisonData) -> str:
         NotJudged.NO_ZERO: "no zero was set yet",
         NotJudged.NO_RECORD: found.remark,
         NotJudged.NO_Y: f"no measured Y in the last {COMPARED_H:g} h of the recordings",
+        NotJudged.NOT_YET: "nothing has been compared yet",
         NotJudged.TOO_LITTLE: f"too little measured Y, {needed} without interruption are needed",
-        NotJudged.SUSPECT: "the service suspected a sensor while Y was measured",
+        NotJudged.SUSPECT: (
+            f"nothing is compared while a sensor is suspected under both models ({found.remark})"
+            if found.remark
+            else "the service suspected a sensor while Y was measured"
+        ),
         NotJudged.UNRELATED: "measured Y does not move, or follows neither model; check its sensor",
     }[found.why]
 
