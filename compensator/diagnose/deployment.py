@@ -168,7 +168,7 @@ def _as_far_as_confirmed(
 def _by_channels(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
-    """Deploy all channels in the place of names with which the engine is worse, where held-out data confirm them."""
+    """Deploy all channels in the place of useless names, or of none, where held-out data clearly confirm them."""
     instead, (whole_um, nothing_um) = by_channels(found), map(rms_of, (held_out.whole, held_out.nothing))
     if instead is None or rms_of(held_out.ceiling) > min(whole_um, LOWERS_CLEARLY * nothing_um):
         return found, effects, held_out

@@ -176,15 +176,16 @@ def _is_surpassed(found: Findings) -> bool:
 
 
 def by_channels(found: Findings) -> Findings | None:
-    """Return findings with all channels in the place of names that are worse than nothing in free run.
+    """Return findings with all channels in the place of names that are worse than nothing in free run, or of none.
 
-    Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect. None
-    where the names are not worse, or where all channels are worse, too.
+    Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect. And
+    what has no name may be as small as the model's own error, and come again all the same. None where the names are not
+    worse, or where all channels are.
     """
     evidence = found.search.evidence
-    if evidence.is_sparse or not found.terms or _is_no_worse(found):
+    if evidence.is_sparse or (_is_no_worse(found) if found.terms else found.remainder is not None):
         return None
-    if not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
+    if found.terms and not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
         return None
     instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False, confirmed=1.0)
     return instead if _is_no_worse(instead) else None

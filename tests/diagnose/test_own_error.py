@@ -191,3 +191,14 @@ def test_what_no_path_explains_is_given_no_path_s_name(seed, tau_min):
     kept = {name: columns[name] for name in ("t_q_degc", "at_degc")}
     found = findings_of(evidence_of(BASE, runs_from(kept | {"y_um": columns["y_um"] + wandering})))
     assert not found.leaves_noise and found.terms == () and not found.belongs
+
+
+def test_what_all_channels_show_clearly_is_deployed_where_nothing_has_a_name():
+    """A weak bearing of the size of what the calibration missed: the residual may be the model's own error."""
+    machine = next(c for c in _cases(420_000) if (c.family, c.seed) == ("lumped", 420_024)).draw()
+    base = tc.identify(machine.calibration.columns).model
+    found = tc.diagnose(base, machine.record.columns)
+    assert len(found.effects) == 0 and found.verdict == "unexplained"
+    assert [effect.kind for effect in found.model.effects] == ["regression"]
+    before_um, after_um = errors_on_another_day(machine, base, found.model)
+    assert after_um < 0.6 * before_um
