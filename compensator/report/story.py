@@ -42,6 +42,8 @@ WORDS: Mapping[str, str] = {
     LoopAction.BACK: "gone back",
     LoopAction.END: "comparison ended",
     LoopAction.NOTHING: "nothing follows",
+    LoopAction.WAIT: "nothing is compared",
+    LoopAction.WAIT_OVER: "compared again",
     "refused": "refused",
 }
 

@@ -84,7 +84,7 @@ def test_a_base_that_does_not_foretell_the_rest_of_a_record_is_not_called_adequa
 
     def foretold(*given):
         found = held_out_of(*given)
-        return dataclasses.replace(found, nothing=10.0 * found.nothing)
+        return dataclasses.replace(found, nothing=10.0 * found.nothing, ceiling=10.0 * found.ceiling)
 
     search_by(monkeypatch, searched)
     assert figures(diagnose(QUILL, day()))["verdict"] == "adequate"

@@ -69,7 +69,7 @@ def decided(loop: Loop, hours: float, present: Reasons, others: dict[str, Reason
 
 
 def loop_of(*found: Place, watched: Place | None = None, **settings: Any) -> Loop:
-    loop = Loop(LoopSettings(policy="adopt", **settings), 60.0, ["gain:DTF"])
+    loop = Loop(LoopSettings(**{"policy": "adopt", "every_h": 12} | settings), 60.0, ["gain:DTF"])
     loop.state.found, loop.state.watched = list(found), watched
     return loop
 

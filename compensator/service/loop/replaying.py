@@ -23,6 +23,8 @@ _DECIDED = (
     LoopAction.WITHDRAW,
     LoopAction.ADOPT,
     LoopAction.BACK,
+    LoopAction.WAIT,
+    LoopAction.WAIT_OVER,
 )
 
 
