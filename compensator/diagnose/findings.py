@@ -187,7 +187,8 @@ def by_channels(found: Findings) -> Findings | None:
         return None
     if found.terms and not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
         return None
-    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=False, confirmed=1.0)
+    explains = not found.terms
+    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=explains, confirmed=1.0)
     return instead if _is_no_worse(instead) else None
 
 

@@ -200,5 +200,6 @@ def test_what_all_channels_show_clearly_is_deployed_where_nothing_has_a_name():
     found = tc.diagnose(base, machine.record.columns)
     assert len(found.effects) == 0 and found.verdict == "unexplained"
     assert [effect.kind for effect in found.model.effects] == ["regression"]
+    assert "in place of" not in found.summary() and not found.to_dict()["remainder"].get("instead")
     before_um, after_um = errors_on_another_day(machine, base, found.model)
     assert after_um < 0.6 * before_um
