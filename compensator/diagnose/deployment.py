@@ -29,6 +29,9 @@ LOWERS = 0.97
 #: are most of what is left, or something else is (set on 8 drawn machines, where less than this made the fresh run no
 #: better, and on 2 of another simulator). All channels that take the place of names have nothing but this to show.
 LOWERS_CLEARLY = 0.75
+#: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
+#: any slow channel.
+LOWERS_BY_FAR = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +173,8 @@ def _by_channels(
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Deploy all channels in the place of useless names, or of none, where held-out data clearly confirm them."""
     instead, (whole_um, nothing_um) = by_channels(found), map(rms_of, (held_out.whole, held_out.nothing))
-    if instead is None or rms_of(held_out.ceiling) > min(whole_um, LOWERS_CLEARLY * nothing_um):
+    lowers = LOWERS_CLEARLY if effects else LOWERS_BY_FAR
+    if instead is None or rms_of(held_out.ceiling) > min(whole_um, lowers * nothing_um):
         return found, effects, held_out
     effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
