@@ -179,8 +179,11 @@ class Compared:
         level: what follows the mount is better, too.
         """
         shown_um, verdict = self.shown_level_um, self._place.verdict
-        part = BETTER_PART if verdict.measured_by == "probe" else LEVEL_PART
-        if shown_um is None and not self._y_drifted and is_better_about_zero(verdict, part):
+        is_probed = verdict.measured_by == "probe"
+        part = BETTER_PART if is_probed else LEVEL_PART
+        # What creeps beside probes both models are corrected for, and few values often look like a drift.
+        shows_level = is_probed or not self._y_drifted
+        if shown_um is None and shows_level and is_better_about_zero(verdict, part):
             return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um
 
