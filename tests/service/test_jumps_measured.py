@@ -67,6 +67,7 @@ def test_after_a_drift_is_mended_the_offset_is_right_within_an_hour(
     assert f"suspect_channel:{channel}" in outcomes[end + 1].offset.reasons
     wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True)))
     assert np.max(wrong[end : end + 5]) > 5.0 and np.max(wrong[end + 60 :]) < 5.0
+    assert any("measured Y shows that it was wrong" in note.text for o in outcomes for note in o.notes)
     assert any(was_wrong(outcome) for outcome in outcomes)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -327,8 +328,11 @@ def without_sensor(**changes: Any) -> Config:
     return msgspec.structs.replace(found, channel=[one for one in found.channel if one.name != "y_um"])
 
 
-def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice() -> None:
-    loop = LoopRun(without_sensor(), QUILL, Night(shown(extended())))
+@pytest.mark.parametrize("y_drifted", [False, True])
+def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice(y_drifted: bool) -> None:
+    """A drift that is named is no reason to wait for a zero: what creeps both models are corrected for."""
+    found_by_night = dataclasses.replace(shown(extended()), y_drifted=y_drifted)
+    loop = LoopRun(without_sensor(), QUILL, Night(found_by_night))
     source = list(machine(int(2.4 * DAY), noise_um=0.0))
     steps = probed(loop, iter(source), 30)
     assert sum(probe.taken for step in steps for probe in step.outcome.probes) > 40

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import msgspec
 
 from compensator.clock import NS
-from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, LoopAction, Note
@@ -38,7 +37,14 @@ from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place
-from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted, is_disturbed, is_lost, was_wrong
+from compensator.service.loop.trust import (
+    all_suspect_a_sensor,
+    is_contradicted,
+    is_disturbed,
+    is_lost,
+    suspicions,
+    was_wrong,
+)
 from compensator.service.loop.words import begins, named, nothing_follows, surpassed, wait_over, waits
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN
@@ -92,8 +98,8 @@ class Loop:
 
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
-        count = max(len(self.state.candidates), 1)
         state = self.state
+        count = max(len(state.candidates), 1)
         return Compared(place, self._settings, self._period_s, state.error, candidates=count, y_drifted=state.y_drifted)
 
     # ------------------------------------------------------------------ one sample
@@ -133,7 +139,7 @@ class Loop:
             # A newcomer that no sensor speaks against says nothing of two older models that both suspect one.
             if not (contradicted or all_suspect_a_sensor([present, other])):
                 judged += [place] if compared.add(present, other) else []
-            elif compared.add_suspected(other, _suspects(present, other)) and place.is_proposed and not state.exchange:
+            elif compared.add_suspected(other, suspicions(present, other)) and place.is_proposed and not state.exchange:
                 notes += withdraw(self.state, place, "a sensor is suspected, so what was compared does not count")
         for place in state.taken:
             # Until what is warmed up has its place, before the next sample, nothing that was found decides.
@@ -163,7 +169,7 @@ class Loop:
             state.uncompared_ns = state.uncompared_ns or present.sample.time_utc_ns
             state.uncompared_min += self._period_s / 60.0 if is_suspected else 0.0
             is_said = before_min <= longest_min < state.uncompared_min
-            return [waits(state.uncompared_ns, _suspects(present, *others.values()))] if is_said else []
+            return [waits(state.uncompared_ns, suspicions(present, *others.values()))] if is_said else []
         notes = [wait_over(state.uncompared_ns, is_compared=bool(others))] if before_min > longest_min else []
         state.uncompared_min, state.uncompared_ns = 0.0, 0
         return notes
@@ -366,13 +372,6 @@ class Loop:
 
 def _named(place: Place) -> str:
     return f"{place.sha256[:12]} with {named(place.effects)}"
-
-
-def _suspects(*outcomes: Outcome) -> list[str]:
-    """Return for what reasons a sensor is suspected, each once."""
-    codes = (Reason.IMPLAUSIBLE, Reason.RESIDUAL_TOO_LARGE, Reason.T_Q_AT_APART, Reason.T_Q_AT_EXCHANGED)
-    reasons = (reason for outcome in outcomes for reason in outcome.offset.reasons)
-    return list(dict.fromkeys(one for one in reasons if one.startswith(codes)))
 
 
 def _counted(before_min: float, present: Outcome, minutes: float, *, suspected: bool) -> float:

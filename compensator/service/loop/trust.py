@@ -46,6 +46,12 @@ def is_alarmed(reasons: Sequence[str]) -> bool:
     return any(reason.startswith(_ALARMS) for reason in reasons)
 
 
+def suspicions(*outcomes: Outcome) -> list[str]:
+    """Return for what reasons a sensor is suspected under models that processed a sample, each once."""
+    reasons = (reason for outcome in outcomes for reason in outcome.offset.reasons)
+    return list(dict.fromkeys(one for one in reasons if one.startswith((*_ALARMS, *_CONTRADICTED))))
+
+
 def was_wrong(outcome: Outcome) -> bool:
     """Return whether a sample has shown that a temperature was wrong before anything suspected it."""
     return any(note.data.get("code") == Implausibility.WAS_WRONG for note in outcome.notes)
