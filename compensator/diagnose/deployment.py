@@ -173,7 +173,7 @@ def _by_channels(
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Deploy all channels in the place of useless names, or of none, where held-out data clearly confirm them."""
     instead, (whole_um, nothing_um) = by_channels(found), map(rms_of, (held_out.whole, held_out.nothing))
-    lowers = LOWERS_CLEARLY if effects else LOWERS_BY_FAR
+    lowers = LOWERS_CLEARLY if found.terms else LOWERS_BY_FAR
     # What is not known, in a record without a block to hold out, confirms nothing.
     if instead is None or not rms_of(held_out.ceiling) <= min(whole_um, lowers * nothing_um):
         return found, effects, held_out
