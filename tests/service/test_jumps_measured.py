@@ -10,12 +10,14 @@ import pytest
 from compensator.errors import DataError
 from compensator.messages import number
 from compensator.model.effects import effect_from
-from compensator.model.thermal_model import ThermalModel
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import Path, ThermalModel
+from compensator.model.transfer_function import TransferFunction
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.trust import was_wrong
 from compensator.service.state import decode_state, encode_state
 from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
-from tests.service.records import QUILL, sample
+from tests.service.records import QUILL, direct, sample
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +202,56 @@ def test_beside_a_model_that_was_wrong_before_a_jump_it_is_not_believed_by_chanc
 
     outcomes = run(day, change, y=True)
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[301:420])
+
+
+#: The first sample after a restart.
+RESTARTED = 203
+
+
+def heated_while_stopped(*, spike: int | None = None, y: bool = True, std_um: float = 1.0) -> list[Outcome]:
+    """A heating begins within a pause of three samples; T_Q and Y are right, but for one value of T_Q at a spike."""
+    function = TransferFunction(numerator=(320.0, 5.0), denominator=(64.0, 1.0), unit="um/K")
+    base = direct("kalman")
+    estimator = dataclasses.replace(base.estimator, drive_walk_std=0.05, t_q_noise_std_k=0.03)
+    model = dataclasses.replace(base, dtf=Path.from_continuous(function, 60.0), estimator=estimator)
+    minutes, at = np.arange(480), np.full(480, 20.0)
+    t_q = at + np.where(minutes < RESTARTED - 4, 0.0, 6.0 * -np.expm1((RESTARTED - 4 - minutes) / 10.0))
+    engine = Engine(model)
+    engine.set_reference(20.0, 20.0)
+    deformed = np.array([estimate.y_um for estimate in engine.run(t_q, at)])
+    random = np.random.default_rng(4)
+    noise = random.normal(0.0, [[0.02], [0.02], [0.5]], (3, 480))
+    compensation, outcomes = Compensation(settings({"residual_std_um": std_um}), model), []
+    for i in minutes.tolist():
+        if RESTARTED - 3 <= i < RESTARTED:
+            continue
+        if i == RESTARTED:
+            compensation.pause(3)
+        read = dict(
+            zip(("t_q_degc", "at_degc", "y_um"), (noise[:, i] + (t_q[i], at[i], deformed[i])).tolist(), strict=True)
+        )
+        read["t_q_degc"] -= 12.0 if i == spike else 0.0
+        outcomes.append(compensation.process(sample(i, read if y else read | {"y_um": np.nan})))
+    return outcomes
+
+
+@pytest.mark.parametrize(("std_um", "within"), [(1.0, 15), (3.0, 180)])
+def test_a_heating_that_begins_while_the_service_restarts_is_no_jump_where_measured_y_shows_it(
+    std_um: float, within: int
+) -> None:
+    """A switched heat is unexpected for both engines; Y confirms T_Q, however little each of its values says."""
+    outcomes = heated_while_stopped(std_um=std_um)
+    assert "unconfirmed_channel:t_q_degc" in outcomes[RESTARTED - 3].offset.reasons
+    assert not any("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes)
+    assert outcomes[RESTARTED - 3 + within].offset.state == "ok"
+
+
+def test_one_wrong_value_of_an_unconfirmed_channel_leaves_it_as_it_was() -> None:
+    """It is back to what it has shown while it was used, though not to what the doubt about it expects."""
+    whole, outcomes = (heated_while_stopped(spike=spike, std_um=3.0) for spike in (None, 280))
+    at = 280 - 3
+    for o in (whole[at], outcomes[at - 1], outcomes[at + 8]):
+        assert "unconfirmed_channel:t_q_degc" in o.offset.reasons
+    assert "suspect_channel:t_q_degc" in outcomes[at].offset.reasons
+    apart = offsets(outcomes) - offsets(whole)
+    assert np.max(np.abs(apart[at + 8 :])) < 0.5

@@ -366,6 +366,13 @@ class JumpEngines:
         """Return whether a value of Y, see `speaks`, agrees with the believing engine."""
         return abs(grown_um - self.believing.grown_um) < _FITS * std_um
 
+    def favours(self, grown_um: float, std_um: float) -> float:
+        """Return the log likelihood ratio of a value of Y, see `speaks`, for the believing engine."""
+        believing, shifted = (
+            min(((grown_um - run.grown_um) / std_um) ** 2, _CLIP * _CLIP) for run in (self.believing, self.shifted)
+        )
+        return 0.5 * (shifted - believing)
+
     def speaks(self, grown_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
 

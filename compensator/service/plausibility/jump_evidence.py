@@ -16,6 +16,10 @@ _REFUTED = 12.0
 _Y_SAMPLES = 10
 #: The same by the change since the zero alone. An engine that is wrong agrees with it on its way, but not for so long.
 _Y_ZERO_SAMPLES = 45
+#: Samples with Y that count as one: its errors last. At most so much speaks for the believing engine.
+_Y_CORRELATED, _MOST_BY_Y = 60.0, 30.0
+#: Log likelihood ratio by which one value of Y contradicts what the temperatures say.
+_CONTRADICTS = 4.0
 #: So many of them are taken back by one that does not agree: some values are outside of what is expected by chance.
 _Y_MISFIT = 3
 #: Probes that must speak for a channel: one may have met a chip.
@@ -40,6 +44,11 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:
         return
     if not math.isnan(grown.by_level):
         speaks = engines.speaks(grown.by_level, grown.level_std_um)
+        favours = engines.favours(grown.by_level, grown.level_std_um)
+        state.y_ratio = min(state.y_ratio + favours / _Y_CORRELATED, _MOST_BY_Y)
+        if engines.fits_y(grown.by_level, grown.level_std_um) and favours > _CONTRADICTS:
+            # A heat that is switched is unexpected for both, and less so for the one that knows less of it.
+            state.ratio = max(state.ratio, 0.0)
         state.y_for = state.y_for + 1 if speaks > 0 else 0
         state.y_against = state.y_against + 1 if speaks < 0 else 0
     if not math.isnan(grown.by_zero):
@@ -61,7 +70,7 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
 
 def confirmed_by(state: JumpState) -> str:
     """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
-    if state.y_for >= _Y_SAMPLES or state.y_zero_for >= _Y_ZERO_SAMPLES:
+    if state.y_for >= _Y_SAMPLES or state.y_zero_for >= _Y_ZERO_SAMPLES or state.y_ratio >= _AGREES:
         return "measured Y agrees"
     if state.probes_for >= _PROBES:
         return "probes agree"

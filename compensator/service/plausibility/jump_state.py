@@ -118,6 +118,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         The same for the believing engine by the change since the zero.
     y_fits : int
         Samples for which that agrees with the believing engine, and perhaps with both, less some for each other one.
+    y_ratio : float
+        Log likelihood ratio of the believing engine over the shifted one by measured Y.
     probes_for, probes_against : int
         Probes that have spoken for them.
     probes_fit : int
@@ -158,6 +160,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     y_against: Count = 0
     y_zero_for: Count = 0
     y_fits: Count = 0
+    y_ratio: Number = 0.0
     probes_for: Count = 0
     probes_fit: Count = 0
     probes_against: Count = 0
@@ -228,7 +231,7 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def start_evidence(self) -> None:
         """Count the evidence from here on."""
-        self.samples, self.ratio = 0, 0.0
+        self.samples, self.ratio, self.y_ratio = 0, 0.0, 0.0
         self.y_for = self.y_against = self.y_zero_for = self.y_fits = 0
         self.probes_for = self.probes_against = self.probes_fit = 0
 

@@ -58,7 +58,13 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 def suspected(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], *, is_alone: bool
+    engine: Engine,
+    engines: JumpEngines,
+    state: JumpState,
+    offered: Mapping[str, float],
+    others: Mapping[str, float],
+    *,
+    is_alone: bool,
 ) -> Verdict:
     """Decide whether channels that are not used are used again, and from which engine on.
 
@@ -72,6 +78,8 @@ def suspected(
         State of the watch.
     offered : mapping of str to float
         Measured temperatures, °C.
+    others : mapping of str to float
+        Usable values of the auxiliary channels.
     is_alone : bool
         Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
@@ -79,6 +87,9 @@ def suspected(
     if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
         if state.leaves_something and is_unsteady(state):
             return _settle(engine, engines, state, offered) if is_alone else Verdict()
+        was_used = is_alone and state.phase == Phase.SUSPECT_AFTER_USE
+        if state.leaves_something and was_used and engines.fits(engine, state, offered):
+            return _use_as_before(engine, engines, state, offered, others)
         if state.leaves_something:
             return _keep_what_is_left(engine, engines, state, offered, is_alone=is_alone)
         found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
@@ -93,6 +104,20 @@ def suspected(
     if is_alone and is_good_enough(state) and not any(map(math.isnan, offered.values())):
         return _settle(engine, engines, state, offered, FITS)
     return Verdict()
+
+
+def _use_as_before(
+    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
+) -> Verdict:
+    """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then."""
+    state.keep_what_is_left()
+    state.phase = Phase.UNCONFIRMED
+    state.start_evidence()
+    estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
+    engines.believe_from_used(engine)
+    engines.believing.estimate = estimate
+    notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
+    return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
 
 
 def _keep_what_is_left(
