@@ -177,7 +177,9 @@ def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> 
     before, after = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um
     text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
     extended = dump_model(found.model).encode() if effects else None
-    y_drifted = any(effect.kind in _OF_Y for one in (found, whole) for effect in one.effects)
+    # Where an effect begins within the record the whole of it may take that for a step; its end, explained, does not.
+    go_by = (found,) if found.verdict == "explained" else (found, whole)
+    y_drifted = any(effect.kind in _OF_Y for one in go_by for effect in one.effects)
     return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole), y_drifted)
 
 

@@ -547,6 +547,25 @@ def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) ->
     assert any(data.get("code") == "accepted" for _, _, data in outcome.notes) and watch.suspects == ()
 
 
+def test_probes_of_which_none_decides_confirm_a_channel_together(day: dict[str, np.ndarray]) -> None:
+    compensation = Compensation(settings(), QUILL)
+    for i in range(BEGIN + 9):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += math.nan if BEGIN - 20 <= i < BEGIN else 3.0 * (i >= BEGIN)
+        compensation.process(sample(i, values))
+    watch = compensation._jumps
+    believing, shifted = watch.state.believing, watch.state.shifted
+    assert believing is not None and believing.estimate is not None
+    assert shifted is not None and shifted.estimate is not None
+    std_um = abs(believing.estimate.y_um - shifted.estimate.y_um) / 3.7
+    for number_of_probes in (1, 2):
+        assert watch.unconfirmed == ("t_q_degc",)
+        watch.receive_probe(believing.estimate.y_um, std_um, 0.0, 0.0)
+        assert watch.state.probes_for == 0
+        outcome = compensation.process(sample(BEGIN + 8 + number_of_probes, values))
+    assert watch.unconfirmed == () and any("probes agree" in text for _, text, _ in outcome.notes)
+
+
 def test_a_loose_contact_must_be_back_for_longer_each_time(day: dict[str, np.ndarray]) -> None:
     def loose(i: int, values: dict[str, float]) -> None:
         if BEGIN <= i < END and (i // 8) % 2 == 0:

@@ -208,8 +208,8 @@ def test_beside_a_model_that_was_wrong_before_a_jump_it_is_not_believed_by_chanc
 RESTARTED = 203
 
 
-def heated_while_stopped(*, spike: int | None = None, y: bool = True, std_um: float = 1.0) -> list[Outcome]:
-    """A heating begins within a pause of three samples; T_Q and Y are right, but for one value of T_Q at a spike."""
+def heated_while_stopped(*, spike: tuple[str, int] | None = None, std_um: float = 1.0) -> list[Outcome]:
+    """A heating begins within a pause of three samples; T_Q, AT and Y are right, but for one value, the spike."""
     function = TransferFunction(numerator=(320.0, 5.0), denominator=(64.0, 1.0), unit="um/K")
     base = direct("kalman")
     estimator = dataclasses.replace(base.estimator, drive_walk_std=0.05, t_q_noise_std_k=0.03)
@@ -230,8 +230,9 @@ def heated_while_stopped(*, spike: int | None = None, y: bool = True, std_um: fl
         read = dict(
             zip(("t_q_degc", "at_degc", "y_um"), (noise[:, i] + (t_q[i], at[i], deformed[i])).tolist(), strict=True)
         )
-        read["t_q_degc"] -= 12.0 if i == spike else 0.0
-        outcomes.append(compensation.process(sample(i, read if y else read | {"y_um": np.nan})))
+        if spike is not None and i == spike[1]:
+            read[spike[0]] -= 12.0
+        outcomes.append(compensation.process(sample(i, read)))
     return outcomes
 
 
@@ -246,9 +247,10 @@ def test_a_heating_that_begins_while_the_service_restarts_is_no_jump_where_measu
     assert outcomes[RESTARTED - 3 + within].offset.state == "ok"
 
 
-def test_one_wrong_value_of_an_unconfirmed_channel_leaves_it_as_it_was() -> None:
+@pytest.mark.parametrize("channel", ["t_q_degc", "at_degc"])
+def test_one_wrong_value_leaves_an_unconfirmed_channel_as_it_was(channel: str) -> None:
     """It is back to what it has shown while it was used, though not to what the doubt about it expects."""
-    whole, outcomes = (heated_while_stopped(spike=spike, std_um=3.0) for spike in (None, 280))
+    whole, outcomes = (heated_while_stopped(spike=spike, std_um=3.0) for spike in (None, (channel, 280)))
     at = 280 - 3
     for o in (whole[at], outcomes[at - 1], outcomes[at + 8]):
         assert "unconfirmed_channel:t_q_degc" in o.offset.reasons

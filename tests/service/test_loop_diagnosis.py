@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -28,17 +30,33 @@ def begun() -> list[Outcome]:
     return [step.outcome for step in run(loop, machine(SAMPLES, acts=lambda i: float(i > BEGINS)))]
 
 
+@pytest.fixture(scope="module")
+def knocked() -> DiagnosisResult:
+    """Diagnosis of a machine whose mount was knocked."""
+    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
+    steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > 800)))
+    return diagnoses_of_table(usable_table([step.outcome for step in steps]), QUILL)[0]
+
+
 @once
 def test_an_effect_that_began_within_the_record_is_found_in_the_end_of_it(begun: list[Outcome]) -> None:
     found = diagnosis_of_record(begun, QUILL)
     assert found.model is not None and "coolant_degc" in " ".join(found.effects)
 
 
-def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate() -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
-    steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > 800)))
-    found = diagnosis_of_record([step.outcome for step in steps], QUILL)
-    assert found.model is None and found.effects == () and "step" in found.needs
+def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate(knocked: DiagnosisResult) -> None:
+    found = api.summarised(knocked, knocked, QUILL)
+    assert found.model is None and found.effects == () and "step" in found.needs and found.y_drifted
+
+
+@once
+def test_a_step_that_only_the_whole_of_a_record_shows_is_the_begin_of_what_its_end_explains(
+    begun: list[Outcome], knocked: DiagnosisResult
+) -> None:
+    end, _ = diagnoses_of_table(usable_table(begun), QUILL)
+    assert end.verdict == "explained" and not api.summarised(end, knocked, QUILL).y_drifted
+    unexplained = dataclasses.replace(end, diagnosis=dataclasses.replace(end.diagnosis, verdict="partly_explained"))
+    assert api.summarised(unexplained, knocked, QUILL).y_drifted
 
 
 @once

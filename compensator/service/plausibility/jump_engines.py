@@ -490,6 +490,25 @@ def count_held(state: JumpState, engine: Engine, at_degc: float, least_k: float)
     state.at_held = state.at_held + 1 if is_back else 0
 
 
+def count_as_used(state: JumpState, engine: Engine, offered: Mapping[str, float]) -> None:
+    """Count the samples for which all channels are where they are expected by what they showed while they were used.
+
+    Parameters
+    ----------
+    state : JumpState
+        State of the watch, which keeps the count.
+    engine : Engine
+        Engine of the compensation, which goes on without them.
+    offered : mapping of str to float
+        Measured temperatures, °C.
+    """
+    is_as_used = state.phase == Phase.SUSPECT_AFTER_USE
+    for name in state.jumps:
+        expected, std = expected_value(engine, name, NAN if "at_degc" in state.jumps else offered["at_degc"])
+        is_as_used = is_as_used and abs(offered[name] - expected) <= NEAR * std
+    state.as_used = state.as_used + 1 if is_as_used else 0
+
+
 def expected_value(engine: Engine, name: str, at_degc: float) -> tuple[float, float]:
     """Return the expected value of a channel and its standard deviation, °C and K."""
     found = engine.forecast(at_degc)

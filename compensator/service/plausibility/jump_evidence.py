@@ -62,6 +62,8 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
     if not (state.is_suspect or state.is_unconfirmed) or math.isnan(grown_um):
         return
     speaks = engines.speaks(grown_um, std_um)
+    # One probe alone decides nothing: it may have met a chip.
+    state.y_ratio = min(state.y_ratio + min(engines.favours(grown_um, std_um), _AGREES / _PROBES), _MOST_BY_Y)
     state.probes_for += speaks > 0
     state.probes_against += speaks < 0
     if state.age >= _APART_SAMPLES:
@@ -70,9 +72,10 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
 
 def confirmed_by(state: JumpState) -> str:
     """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
-    if state.y_for >= _Y_SAMPLES or state.y_zero_for >= _Y_ZERO_SAMPLES or state.y_ratio >= _AGREES:
+    by_y = state.y_ratio >= _AGREES
+    if state.y_for >= _Y_SAMPLES or state.y_zero_for >= _Y_ZERO_SAMPLES or (by_y and not state.probes_fit):
         return "measured Y agrees"
-    if state.probes_for >= _PROBES:
+    if state.probes_for >= _PROBES or by_y:
         return "probes agree"
     if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
         return "the model agrees"

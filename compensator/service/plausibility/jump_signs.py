@@ -19,9 +19,10 @@ _JUMP = 6.0
 
 #: Since when, and why, a channel is unconfirmed.
 UNSEEN, RESTED, AIR = "after samples without it", "now that it is at rest", "and T_Q does not follow"
-BESIDE, LEFT, FITS = (
+BESIDE, LEFT, AS_USED, FITS = (
     "while another channel is in question",
     "after most of its jump is gone",
+    "as it did before that jump",
     "too little for measured Y or probes to tell",
 )
 

@@ -106,6 +106,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Consecutive samples for which AT of `Phase.AIR`, or exchanged channels, have been on their way back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
+    as_used : int
+        Consecutive samples for which all are where they are expected by what they showed while they were used.
     last : dict of str to float
         Values of the last sample with a jump under way, °C.
     unseen : dict of str to int
@@ -119,7 +121,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     y_fits : int
         Samples for which that agrees with the believing engine, and perhaps with both, less some for each other one.
     y_ratio : float
-        Log likelihood ratio of the believing engine over the shifted one by measured Y.
+        Log likelihood ratio of the believing engine over the shifted one by measured Y and probes.
     probes_for, probes_against : int
         Probes that have spoken for them.
     probes_fit : int
@@ -156,6 +158,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     exchanged: Exchanged = "no"
     moving: Count = 0
     at_held: Count = 0
+    as_used: Count = 0
     y_for: Count = 0
     y_against: Count = 0
     y_zero_for: Count = 0
@@ -205,6 +208,16 @@ class JumpState(msgspec.Struct, kw_only=True):
         }
         self.start_counts()
 
+    def keep_as_used(self) -> None:
+        """Go on with the jumps from before they were used; a channel that has only come and gone is in none."""
+        kept = self.kept_k()
+        self.jumps = {
+            name: ChannelJump(size_k=kept[name], std_k=jump.std_k, first_k=kept[name])
+            for name, jump in self.jumps.items()
+            if kept[name]
+        }
+        self.start_counts()
+
     def kept_k(self) -> dict[str, float]:
         """Return by how much each channel is off now, K: what is left of its jump where it is back."""
         return {name: jump.left_k if jump.back else jump.size_k for name, jump in self.jumps.items()}
@@ -225,7 +238,7 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def start_counts(self) -> None:
         """Count consecutive samples from here on."""
-        self.at_held = self.moving = 0
+        self.at_held = self.as_used = self.moving = 0
         for jump in self.jumps.values():
             jump.back = 0
 

@@ -19,6 +19,7 @@ from compensator.service.plausibility.jump_engines import (
 from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_good_enough, is_unlikely
 from compensator.service.plausibility.jump_signs import (
     AIR,
+    AS_USED,
     FITS,
     LEFT,
     NEAR,
@@ -84,12 +85,11 @@ def suspected(
         Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
     needed = needed_samples(state)
+    if is_alone and state.as_used >= needed and any(state.kept_k().values()):
+        return _use_as_before(engine, engines, state, offered, others)
     if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
         if state.leaves_something and is_unsteady(state):
             return _settle(engine, engines, state, offered) if is_alone else Verdict()
-        was_used = is_alone and state.phase == Phase.SUSPECT_AFTER_USE
-        if state.leaves_something and was_used and engines.fits(engine, state, offered):
-            return _use_as_before(engine, engines, state, offered, others)
         if state.leaves_something:
             return _keep_what_is_left(engine, engines, state, offered, is_alone=is_alone)
         found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
@@ -110,14 +110,15 @@ def _use_as_before(
     engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
 ) -> Verdict:
     """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then."""
-    state.keep_what_is_left()
+    names = list(state.jumps)
+    state.keep_as_used()
     state.phase = Phase.UNCONFIRMED
     state.start_evidence()
     estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
     engines.believe_from_used(engine)
     engines.believing.estimate = estimate
-    notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
-    return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
+    notes = [unconfirmed_note(name, jump.size_k, AS_USED) for name, jump in state.jumps.items()]
+    return Verdict(estimate, notes, {name: offered[name] for name in names})
 
 
 def _keep_what_is_left(

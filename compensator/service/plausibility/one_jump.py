@@ -18,6 +18,7 @@ from compensator.service.plausibility.jump_engines import (
     UNSEEN_SAMPLES,
     Fed,
     JumpEngines,
+    count_as_used,
     count_held,
     grown,
     is_unsteady,
@@ -333,6 +334,7 @@ class OneJump:
         self.state.last |= {name: measured[name] for name in TEMPERATURES if not math.isnan(measured[name])}
         fed = engines.feed(self.state, offered, jumped, self._setup.change_k, self._setup.least_k)
         count_held(self.state, engine, offered["at_degc"], self._setup.least_k)
+        count_as_used(self.state, engine, offered)
         new = [name for name in fed.jumped if was_new or name in seen_again]
         notes += self._entered(engine, engines, offered, fed, [name for name in jumped if name in fed.jumped], new)
         if fed.is_exchange:
