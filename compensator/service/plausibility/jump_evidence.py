@@ -62,8 +62,9 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
     if not (state.is_suspect or state.is_unconfirmed) or math.isnan(grown_um):
         return
     speaks = engines.speaks(grown_um, std_um)
-    # One probe alone decides nothing: it may have met a chip.
-    state.y_ratio = min(state.y_ratio + min(engines.favours(grown_um, std_um), _AGREES / _PROBES), _MOST_BY_Y)
+    if state.is_unconfirmed:
+        # One probe alone decides nothing: it may have met a chip.
+        state.y_ratio = min(state.y_ratio + min(engines.favours(grown_um, std_um), _AGREES / _PROBES), _MOST_BY_Y)
     state.probes_for += speaks > 0
     state.probes_against += speaks < 0
     if state.age >= _APART_SAMPLES:
