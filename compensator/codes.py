@@ -474,6 +474,11 @@ class ModelWarning(Code):
         "What would be deployed increases the error of its own data in free run, so the model was left unchanged.",
         "Record a run that begins at rest, with more change in the inputs.",
     )
+    TOO_SHORT = (
+        "too_short",
+        "The record is too short to extend the model by something that explains it only in part.",
+        "Record for 8 h or more: a day, with heating and cooling.",
+    )
     NOT_CONFIRMED = (
         "not_confirmed",
         "The effects are clear in all data together, but a search without a block of time does not predict it.",

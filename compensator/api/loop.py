@@ -16,6 +16,7 @@ from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
+from compensator.diagnose.deployment import SHORT_H
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
@@ -30,8 +31,8 @@ _OF_Y = ("drift", "step")
 
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
-#: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing.
-SHORTEST_H, FEWEST_PROBES = 7.0, 12
+#: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing, or nothing that is deployed.
+SHORTEST_H, FEWEST_PROBES = SHORT_H, 12
 #: An end must leave less than this part of what a longer part does.
 END_IS_BETTER = 0.7
 

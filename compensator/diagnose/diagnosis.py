@@ -125,6 +125,7 @@ def diagnose(
         deployed=deployed,
         few=few,
         worse_um=chosen.worse_um,
+        too_short_h=chosen.too_short_h,
         start_k=evidence.start_k,
     )
     return Diagnosis(

@@ -214,6 +214,7 @@ def warnings_of(
     deployed: bool,
     few: bool = False,
     worse_um: tuple[float, float] | None = None,
+    too_short_h: float | None = None,
     start_k: float = 0.0,
 ) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found.
@@ -230,6 +231,8 @@ def warnings_of(
         Whether Y was measured now and then, so that held-out blocks do not decide what is deployed.
     worse_um : tuple of float, optional
         What is left in free run without and with what would be deployed, µm rms, where that is clearly worse.
+    too_short_h : float, optional
+        Length of the record, h, where it is too short for what would be deployed.
     start_k : float
         T_Q − AT at the coolest start, K, where that is not at rest as far as T_Q shows; 0 where it is.
     """
@@ -241,6 +244,12 @@ def warnings_of(
             f"({worse_um[1]:.2f} against {worse_um[0]:.2f} µm rms), so the model was left unchanged."
         )
         warnings.append(Remark(ModelWarning.WORSE_IN_FREE_RUN, text))
+    elif too_short_h is not None:
+        text = (
+            f"What was found explains a record of {too_short_h:.1f} h only in part, and in so few hours the own error "
+            "of the model looks like an effect, so it was left unchanged."
+        )
+        warnings.append(Remark(ModelWarning.TOO_SHORT, text))
     # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
     elif any(effect.effect.observed for effect in effects) and (
         rms_after > rms_before or (deployed and rms_after == rms_before)

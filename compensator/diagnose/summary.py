@@ -62,6 +62,11 @@ _NOT_IN_FREE_RUN = (
     "The model lacks an effect; the best explanation found increases the error in free run over the same data, so the "
     "model was left unchanged."
 )
+#: The verdict if the record is too short for what was found.
+_SHORT = (
+    "The model lacks an effect; what was found explains the record only in part, and the record is too short to extend "
+    "the model by it: it was left unchanged."
+)
 #: The verdict if the effects found do not predict held-out values, which decide nothing where they are few.
 _NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
 #: The verdict if nothing was named and the channels show some of what acts.
@@ -241,6 +246,8 @@ def _words(found: Mapping[str, Any]) -> str:
         words = _REVERSED
     elif ModelWarning.WORSE_IN_FREE_RUN in found["warning_codes"]:
         words = _NOT_IN_FREE_RUN
+    elif ModelWarning.TOO_SHORT in found["warning_codes"]:
+        words = _SHORT
     elif ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     elif ModelWarning.NOT_CONFIRMED in found["warning_codes"] and "could_hide" in found:

@@ -24,6 +24,7 @@ from tests.identify.quill_runs import runs_from
 
 #: As `identify` states it: a base whose paths miss 0.6 µm.
 BASE = dataclasses.replace(load_model("quill"), held_out_rms_um=0.6)
+QUILL = load_model("quill")
 
 
 @pytest.fixture(scope="module")
@@ -204,3 +205,17 @@ def test_what_all_channels_show_clearly_is_deployed_where_nothing_has_a_name():
     before_um, after_um = errors_on_another_day(machine, base, found.model)
     held_out = found.diagnosis
     assert after_um < before_um and held_out.after.rms_um < 0.6 * held_out.before.rms_um
+
+
+@pytest.mark.parametrize(("hours", "base", "is_extended"), [(6, BASE, False), (9, BASE, True), (6, QUILL, True)])
+def test_a_few_hours_that_are_explained_in_part_extend_no_approximate_model(hours, base, is_extended):
+    """What is left may be its own error in this very warm-up: held-out blocks of it show no other day."""
+    columns, _, _ = record([draw("input", 3, 5.0)], 80, 24.0)
+    wander = lfilter([1.0], [1.0, -np.exp(-1.0 / 40.0)], np.random.default_rng(2).normal(size=24 * 60))
+    columns["y_um"] = columns["y_um"] + 2.0 * wander / np.std(wander)
+    short = {name: values[: 60 * hours] for name, values in columns.items()}
+    why = tc.diagnose(base, {"t_s": 60.0 * np.arange(60 * hours), **short})
+    assert why.verdict == "partly_explained" and [effect.kind for effect in why.effects] == ["input"]
+    assert bool(why.model.effects) == is_extended
+    assert ("too_short" in why.to_dict()["warning_codes"]) != is_extended
+    assert ("the record is too short" in why.summary()) != is_extended
