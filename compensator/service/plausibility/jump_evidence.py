@@ -16,7 +16,7 @@ _REFUTED = 12.0
 _Y_SAMPLES = 10
 #: The same by the change since the zero alone. An engine that is wrong agrees with it on its way, but not for so long.
 _Y_ZERO_SAMPLES = 45
-#: Samples with Y that count as one: its errors last. At most so much speaks for the believing engine.
+#: Samples with Y that count as one: its errors last. At most so much speaks for either engine.
 _Y_CORRELATED, _MOST_BY_Y = 60.0, 30.0
 #: Log likelihood ratio by which one value of Y contradicts what the temperatures say.
 _CONTRADICTS = 4.0
@@ -45,7 +45,7 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:
     if not math.isnan(grown.by_level):
         speaks = engines.speaks(grown.by_level, grown.level_std_um)
         favours = engines.favours(grown.by_level, grown.level_std_um)
-        state.y_ratio = min(state.y_ratio + favours / _Y_CORRELATED, _MOST_BY_Y)
+        state.y_ratio = max(min(state.y_ratio + favours / _Y_CORRELATED, _MOST_BY_Y), -_MOST_BY_Y)
         if engines.fits_y(grown.by_level, grown.level_std_um) and favours > _CONTRADICTS:
             # A heat that is switched is unexpected for both, and less so for the one that knows less of it.
             state.ratio = max(state.ratio, 0.0)
@@ -90,7 +90,7 @@ def is_good_enough(state: JumpState) -> bool:
 
 def is_contradicted(state: JumpState) -> bool:
     """Return whether measured Y or probes speak for the shifted engine."""
-    return state.y_against >= _Y_SAMPLES or state.probes_against >= _PROBES
+    return state.y_against >= _Y_SAMPLES or state.probes_against >= _PROBES or state.y_ratio <= -_AGREES
 
 
 def is_unlikely(state: JumpState) -> bool:
