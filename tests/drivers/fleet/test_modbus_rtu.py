@@ -201,7 +201,7 @@ async def test_babble_is_bounded_in_time_and_memory(rig: Any, slave: Any) -> Non
         while not stop.is_set():
             for writer in end.writers:
                 writer.write(b"\x55" * 200)
-            await asyncio.sleep(0)
+            await asyncio.sleep(0.001)  # many times what a line carries
 
     task = asyncio.create_task(babble())
     bus.faults.extend([lambda frame: None] * 2)
