@@ -184,7 +184,7 @@ def test_what_was_shown_of_the_level_goes_on_with_other_parameters_that_leave_a_
     begins, since, now, until = 12, 20, 32, 41
 
     def errors_of(left):
-        return ErrorBlocks(blocks=[(n, 1.0 * (n % 2) if n < begins else left(n)) for n in range(now)])
+        return ErrorBlocks(blocks=[(n, 6.0 * (n % 2) if n < begins else left(n)) for n in range(now)])
 
     present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in range(until)])
     before, after = (

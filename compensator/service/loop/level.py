@@ -5,7 +5,8 @@ its channel from the zero, when the effect did not act. Measured Y shows it if n
 time the present model was right about this zero, and about changes more so than the candidate: the effect did not act
 yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. While the two are
 compared what the candidate leaves neither grows nor shrinks, as it would with a mount that creeps; before that the
-effect may still have grown to its full size.
+effect may still have grown to its full size. And it is no larger than what the candidate moves: a small effect is not
+the cause of a large level.
 """
 
 from __future__ import annotations
@@ -88,11 +89,13 @@ def level_um(
     Examples
     --------
     >>> began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
-    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
+    >>> level_um(began, [(n, 6.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
     6.0
     >>> level_um(began, [(n, 0.1 if n < 12 else 6.0) for n in range(40)]) is None  # the effect acted before: a slip
     True
-    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
+    >>> level_um(began, [(n, 6.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
+    True
+    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 6.0) for n in range(40)]) is None  # it moves Y by 3 µm only
     True
     """
     others = dict(other)
@@ -114,7 +117,8 @@ def level_um(
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
     spread_um = float(np.median(np.abs(left_um - middle_um)))
     stays = abs(halves[1] - halves[0]) < STAYS * error_um and spread_um < SPREAD * error_um
-    return middle_um if was_right and stays else None
+    moves = abs(middle_um) <= np.ptp(own - rest)
+    return middle_um if was_right and stays and moves else None
 
 
 def _rms(values: Vector) -> float:
