@@ -547,6 +547,37 @@ def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) ->
     assert any(data.get("code") == "accepted" for _, _, data in outcome.notes) and watch.suspects == ()
 
 
+@pytest.mark.parametrize("again_k", [9.0, -6.0])
+def test_a_channel_that_does_not_return_is_not_used_as_it_was_however_little_is_known(
+    day: dict[str, np.ndarray], again_k: float
+) -> None:
+    """What is expected without the channel is soon as uncertain as its jump is large."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["t_q_degc"] += math.nan if 290 <= i < 300 else 3.0 * (i >= 300) + again_k * (i >= 360)
+
+    outcomes = run(day, change)
+    assert "unconfirmed_channel:t_q_degc" in outcomes[359].offset.reasons
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[361:END])
+
+
+def test_one_probe_refutes_no_channel(day: dict[str, np.ndarray]) -> None:
+    """It may have met a chip."""
+    compensation = Compensation(settings(), QUILL)
+    for i in range(BEGIN + 9):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += math.nan if BEGIN - 20 <= i < BEGIN else 3.0 * (i >= BEGIN)
+        compensation.process(sample(i, values))
+    watch = compensation._jumps
+    for number_of_probes in (1, 2):
+        assert watch.unconfirmed == ("t_q_degc",)
+        shifted = watch.state.shifted
+        assert shifted is not None and shifted.estimate is not None
+        watch.receive_probe(shifted.estimate.y_um, 0.1, 0.0, 0.0)
+        compensation.process(sample(BEGIN + 8 + number_of_probes, values))
+    assert watch.suspects == ("t_q_degc",)
+
+
 def test_probes_of_which_none_decides_confirm_a_channel_together(day: dict[str, np.ndarray]) -> None:
     compensation = Compensation(settings(), QUILL)
     for i in range(BEGIN + 9):

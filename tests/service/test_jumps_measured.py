@@ -209,19 +209,18 @@ RESTARTED = 203
 
 
 def heated_while_stopped(
-    *, spike: tuple[str, int] | None = None, std_um: float = 1.0, wrong_k: float = 0.0
+    *, spike: tuple[str, int] | None = None, std_um: float = 1.0, y_wrong_um: float = 0.0
 ) -> list[Outcome]:
-    """A heating begins within a pause of three samples; T_Q, AT and Y are right, but for one value, the spike.
+    """A heating begins within a pause of three samples; T_Q and AT are right, but for one value, the spike.
 
-    Or nothing is heated, and T_Q is wrong from there on.
+    Y may be wrong from 20 samples later on.
     """
     function = TransferFunction(numerator=(320.0, 5.0), denominator=(64.0, 1.0), unit="um/K")
     base = direct("kalman")
     estimator = dataclasses.replace(base.estimator, drive_walk_std=0.05, t_q_noise_std_k=0.03)
     model = dataclasses.replace(base, dtf=Path.from_continuous(function, 60.0), estimator=estimator)
     minutes, at = np.arange(480), np.full(480, 20.0)
-    heated_k = 0.0 if wrong_k else 6.0
-    t_q = at + np.where(minutes < RESTARTED - 4, 0.0, heated_k * -np.expm1((RESTARTED - 4 - minutes) / 10.0))
+    t_q = at + np.where(minutes < RESTARTED - 4, 0.0, 6.0 * -np.expm1((RESTARTED - 4 - minutes) / 10.0))
     engine = Engine(model)
     engine.set_reference(20.0, 20.0)
     deformed = np.array([estimate.y_um for estimate in engine.run(t_q, at)])
@@ -236,7 +235,7 @@ def heated_while_stopped(
         read = dict(
             zip(("t_q_degc", "at_degc", "y_um"), (noise[:, i] + (t_q[i], at[i], deformed[i])).tolist(), strict=True)
         )
-        read["t_q_degc"] += wrong_k * (i >= RESTARTED)
+        read["y_um"] += y_wrong_um * (i >= RESTARTED + 20)
         if spike is not None and i == spike[1]:
             read[spike[0]] -= 12.0
         outcomes.append(compensation.process(sample(i, read)))
@@ -254,11 +253,16 @@ def test_a_heating_that_begins_while_the_service_restarts_is_no_jump_where_measu
     assert outcomes[RESTARTED - 3 + within].offset.state == "ok"
 
 
-def test_what_measured_y_says_against_an_unconfirmed_channel_adds_up() -> None:
-    """None of its values contradicts T_Q clearly."""
-    outcomes = heated_while_stopped(std_um=2.5, wrong_k=1.5)
-    asked = ["suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes]
-    assert not any(asked[: RESTARTED + 40]) and all(asked[RESTARTED + 200 :])
+def test_a_value_of_y_with_which_neither_agrees_confirms_nothing() -> None:
+    outcomes = heated_while_stopped(std_um=3.0, y_wrong_um=12.0)
+    assert all("unconfirmed_channel:t_q_degc" in o.offset.reasons for o in outcomes[RESTARTED - 3 :])
+
+
+def test_where_y_contradicts_it_a_channel_is_not_used_again_as_it_was() -> None:
+    """It may have been wrong all the time: then Y shows that in hindsight, while the channel is suspect."""
+    outcomes = heated_while_stopped(std_um=3.0, y_wrong_um=12.0, spike=("at_degc", 280))
+    asked = [o.offset.reasons for o in outcomes[280 - 3 :]]
+    assert all("suspect_channel:t_q_degc" in reasons for reasons in asked[:20])
 
 
 @pytest.mark.parametrize("channel", ["t_q_degc", "at_degc"])

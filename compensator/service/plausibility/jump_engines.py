@@ -367,11 +367,14 @@ class JumpEngines:
         return abs(grown_um - self.believing.grown_um) < _FITS * std_um
 
     def favours(self, grown_um: float, std_um: float) -> float:
-        """Return the log likelihood ratio of a value of Y, see `speaks`, for the believing engine."""
-        believing, shifted = (
-            min(((grown_um - run.grown_um) / std_um) ** 2, _CLIP * _CLIP) for run in (self.believing, self.shifted)
-        )
-        return 0.5 * (shifted - believing)
+        """Return the log likelihood ratio of a value of Y, see `speaks`, for the believing engine.
+
+        It is 0 where neither agrees with the value.
+        """
+        believing, shifted = (abs(grown_um - run.grown_um) / std_um for run in (self.believing, self.shifted))
+        if min(believing, shifted) >= _FITS:
+            return 0.0
+        return 0.5 * (min(shifted, _CLIP) ** 2 - min(believing, _CLIP) ** 2)
 
     def speaks(self, grown_um: float, std_um: float) -> int:
         """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
@@ -503,9 +506,11 @@ def count_as_used(state: JumpState, engine: Engine, offered: Mapping[str, float]
         Measured temperatures, °C.
     """
     is_as_used = state.phase == Phase.SUSPECT_AFTER_USE
-    for name in state.jumps:
+    for name, jump in state.jumps.items():
         expected, std = expected_value(engine, name, NAN if "at_degc" in state.jumps else offered["at_degc"])
-        is_as_used = is_as_used and abs(offered[name] - expected) <= NEAR * std
+        # As for a return: where the expectation itself is uncertain by the size of the jump, it shows nothing.
+        near = NEAR * std
+        is_as_used &= abs(offered[name] - expected) <= near <= _RETURNED_MOST * max(abs(jump.first_k), abs(jump.size_k))
     state.as_used = state.as_used + 1 if is_as_used else 0
 
 
@@ -527,6 +532,11 @@ def grown(estimate: Estimate, at_zero: Estimate | None) -> list[float]:
     if at_zero is None:
         return values
     return [value - zero for value, zero in zip(values, _values(at_zero), strict=True)]
+
+
+def contradicts(grown_um: float, std_um: float, estimate: Estimate, at_zero: Estimate | None) -> bool:
+    """Return whether a value of Y, see `JumpEngines.speaks`, does not agree with an estimate; not where it is NaN."""
+    return abs(grown_um - grown(estimate, at_zero)[0]) >= _FITS * std_um
 
 
 def stds(estimate: Estimate) -> list[float]:

@@ -45,8 +45,8 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:
     if not math.isnan(grown.by_level):
         speaks = engines.speaks(grown.by_level, grown.level_std_um)
         favours = engines.favours(grown.by_level, grown.level_std_um)
-        state.y_ratio = max(min(state.y_ratio + favours / _Y_CORRELATED, _MOST_BY_Y), -_MOST_BY_Y)
-        if engines.fits_y(grown.by_level, grown.level_std_um) and favours > _CONTRADICTS:
+        _add(state, favours / _Y_CORRELATED)
+        if favours > _CONTRADICTS:
             # A heat that is switched is unexpected for both, and less so for the one that knows less of it.
             state.ratio = max(state.ratio, 0.0)
         state.y_for = state.y_for + 1 if speaks > 0 else 0
@@ -64,11 +64,16 @@ def weigh_probe(state: JumpState, engines: JumpEngines, grown_um: float, std_um:
     speaks = engines.speaks(grown_um, std_um)
     if state.is_unconfirmed:
         # One probe alone decides nothing: it may have met a chip.
-        state.y_ratio = min(state.y_ratio + min(engines.favours(grown_um, std_um), _AGREES / _PROBES), _MOST_BY_Y)
+        _add(state, min(engines.favours(grown_um, std_um), _AGREES / _PROBES))
     state.probes_for += speaks > 0
     state.probes_against += speaks < 0
     if state.age >= _APART_SAMPLES:
         state.probes_fit = state.probes_fit + 1 if engines.fits_y(grown_um, std_um) else 0
+
+
+def _add(state: JumpState, favours: float) -> None:
+    """Add what speaks for the believing engine, or against it: then it must speak for it for longer."""
+    state.y_ratio = max(min(state.y_ratio + favours, _MOST_BY_Y), -_MOST_BY_Y)
 
 
 def confirmed_by(state: JumpState) -> str:
@@ -90,7 +95,7 @@ def is_good_enough(state: JumpState) -> bool:
 
 def is_contradicted(state: JumpState) -> bool:
     """Return whether measured Y or probes speak for the shifted engine."""
-    return state.y_against >= _Y_SAMPLES or state.probes_against >= _PROBES or state.y_ratio <= -_AGREES
+    return state.y_against >= _Y_SAMPLES or state.probes_against >= _PROBES
 
 
 def is_unlikely(state: JumpState) -> bool:

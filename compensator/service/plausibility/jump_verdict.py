@@ -9,9 +9,11 @@ import msgspec
 
 from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
+from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.jump_engines import (
     JumpEngines,
     Run,
+    contradicts,
     expected_value,
     is_unsteady,
     needed_samples,
@@ -64,6 +66,7 @@ def suspected(
     state: JumpState,
     offered: Mapping[str, float],
     others: Mapping[str, float],
+    grown_y: GrownY,
     *,
     is_alone: bool,
 ) -> Verdict:
@@ -81,12 +84,17 @@ def suspected(
         Measured temperatures, °C.
     others : mapping of str to float
         Usable values of the auxiliary channels.
+    grown_y : GrownY
+        Deformation by measured Y.
     is_alone : bool
         Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
     needed = needed_samples(state)
-    if is_alone and state.as_used >= needed and any(state.kept_k().values()):
-        return _use_as_before(engine, engines, state, offered, others)
+    was_used = is_alone and state.phase == Phase.SUSPECT_AFTER_USE
+    if was_used and state.as_used >= needed and any(state.kept_k().values()):
+        used = _use_as_before(engine, engines, state, offered, others, grown_y)
+        if used is not None:
+            return used
     if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
         if state.leaves_something and is_unsteady(state):
             return _settle(engine, engines, state, offered) if is_alone else Verdict()
@@ -107,14 +115,26 @@ def suspected(
 
 
 def _use_as_before(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], others: Mapping[str, float]
-) -> Verdict:
-    """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then."""
+    engine: Engine,
+    engines: JumpEngines,
+    state: JumpState,
+    offered: Mapping[str, float],
+    others: Mapping[str, float],
+    grown_y: GrownY,
+) -> Verdict | None:
+    """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then.
+
+    Not where measured Y contradicts them: it may show in hindsight what was wrong. Then nothing is changed.
+    """
+    before = engine.snapshot()
+    estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
+    if contradicts(grown_y.by_level, grown_y.level_std_um, estimate, engines.zero_in_use):
+        engine.restore(before)
+        return None
     names = list(state.jumps)
     state.keep_as_used()
     state.phase = Phase.UNCONFIRMED
     state.start_evidence()
-    estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
     engines.believe_from_used(engine)
     engines.believing.estimate = estimate
     notes = [unconfirmed_note(name, jump.size_k, AS_USED) for name, jump in state.jumps.items()]

@@ -353,7 +353,7 @@ class OneJump:
             self.state.phase = Phase.SUSPECT
         elif (was_unconfirmed or (was_new and self.state.may_be_exchanged)) and self.state.is_suspect:
             estimate = engines.go_without(engine, self.suspects, offered, others)
-        verdict = self._verdict(engine, engines, offered, others)
+        verdict = self._verdict(engine, engines, offered, others, grown_y)
         estimate = verdict.estimate or estimate
         if verdict.ends:
             estimate = self._finish(engine, verdict, estimate, offered, others)
@@ -432,12 +432,17 @@ class OneJump:
         return [unconfirmed_note(name, state.jumps[name].size_k, when[name]) for name in fed.jumped]
 
     def _verdict(
-        self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float], others: Mapping[str, float]
+        self,
+        engine: Engine,
+        engines: JumpEngines,
+        offered: Mapping[str, float],
+        others: Mapping[str, float],
+        grown_y: GrownY,
     ) -> Verdict:
         if not self.state.is_suspect:
             return watched(engine, engines, self.state, offered)
         is_alone = self._beside is None or not self._beside.is_open
-        return suspected(engine, engines, self.state, offered, others, is_alone=is_alone)
+        return suspected(engine, engines, self.state, offered, others, grown_y, is_alone=is_alone)
 
     def _finish(
         self,
