@@ -18,8 +18,8 @@ _Y_SAMPLES = 10
 _Y_ZERO_SAMPLES = 45
 #: Samples with Y that count as one: its errors last. At most so much speaks for either engine.
 _Y_CORRELATED, _MOST_BY_Y = 60.0, 30.0
-#: Log likelihood ratio by which one value of Y contradicts what the temperatures say.
-_CONTRADICTS = 4.0
+#: Log likelihood ratio by which one value of Y outweighs what the temperatures say.
+_OUTWEIGHS = 4.0
 #: So many of them are taken back by one that does not agree: some values are outside of what is expected by chance.
 _Y_MISFIT = 3
 #: Probes that must speak for a channel: one may have met a chip.
@@ -46,7 +46,7 @@ def weigh_y(state: JumpState, engines: JumpEngines, grown: GrownY) -> None:
         speaks = engines.speaks(grown.by_level, grown.level_std_um)
         favours = engines.favours(grown.by_level, grown.level_std_um)
         _add(state, favours / _Y_CORRELATED)
-        if favours > _CONTRADICTS:
+        if favours > _OUTWEIGHS:
             # A heat that is switched is unexpected for both, and less so for the one that knows less of it.
             state.ratio = max(state.ratio, 0.0)
         state.y_for = state.y_for + 1 if speaks > 0 else 0
