@@ -32,8 +32,6 @@ LOWERS_CLEARLY = 0.75
 #: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
 #: any slow channel.
 LOWERS_BY_FAR = 0.6
-
-
 #: From a record shorter than this, h, a model with an error of its own is extended only by names that leave noise.
 SHORT_H = 8.0
 

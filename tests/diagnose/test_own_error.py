@@ -22,9 +22,9 @@ from sim_hardware.drawn_machines.cases import _cases
 from tests.diagnose.scenarios import draw, held_out_errors, record
 from tests.identify.quill_runs import runs_from
 
-#: As `identify` states it: a base whose paths miss 0.6 µm.
-BASE = dataclasses.replace(load_model("quill"), held_out_rms_um=0.6)
 QUILL = load_model("quill")
+#: As `identify` states it: a base whose paths miss 0.6 µm.
+BASE = dataclasses.replace(QUILL, held_out_rms_um=0.6)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_model_with_it_errs_less_on_another_day(scenarios):
 
 def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios):
     columns, _, _ = record(scenarios[:1], 82, 12.0)
-    assert findings_of(evidence_of(load_model("quill"), runs_from(columns))).remainder is None
+    assert findings_of(evidence_of(QUILL, runs_from(columns))).remainder is None
     columns, _, _ = record([draw("step", 3, 5.0)], 83, 24.0)
     found = findings_of(evidence_of(BASE, runs_from(columns)))
     assert [term.hypothesis.place[0] for term in found.terms] == ["step"] and found.remainder is None

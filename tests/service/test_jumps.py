@@ -561,13 +561,19 @@ def test_a_channel_that_does_not_return_is_not_used_as_it_was_however_little_is_
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[361:END])
 
 
-def test_one_probe_refutes_no_channel(day: dict[str, np.ndarray]) -> None:
-    """It may have met a chip."""
+def with_t_q_unconfirmed(day: dict[str, np.ndarray]) -> tuple[Compensation, dict[str, float]]:
+    """A compensation without Y whose T_Q reads 3 K more after samples without it, and the last values."""
     compensation = Compensation(settings(), QUILL)
     for i in range(BEGIN + 9):
         values = readings(day, i) | {"y_um": math.nan}
         values["t_q_degc"] += math.nan if BEGIN - 20 <= i < BEGIN else 3.0 * (i >= BEGIN)
         compensation.process(sample(i, values))
+    return compensation, values
+
+
+def test_one_probe_refutes_no_channel(day: dict[str, np.ndarray]) -> None:
+    """It may have met a chip."""
+    compensation, values = with_t_q_unconfirmed(day)
     watch = compensation._jumps
     for number_of_probes in (1, 2):
         assert watch.unconfirmed == ("t_q_degc",)
@@ -579,11 +585,7 @@ def test_one_probe_refutes_no_channel(day: dict[str, np.ndarray]) -> None:
 
 
 def test_probes_of_which_none_decides_confirm_a_channel_together(day: dict[str, np.ndarray]) -> None:
-    compensation = Compensation(settings(), QUILL)
-    for i in range(BEGIN + 9):
-        values = readings(day, i) | {"y_um": math.nan}
-        values["t_q_degc"] += math.nan if BEGIN - 20 <= i < BEGIN else 3.0 * (i >= BEGIN)
-        compensation.process(sample(i, values))
+    compensation, values = with_t_q_unconfirmed(day)
     watch = compensation._jumps
     believing, shifted = watch.state.believing, watch.state.shifted
     assert believing is not None and believing.estimate is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from enum import StrEnum
 from typing import Literal
 
@@ -202,19 +202,16 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     def keep_what_is_left(self) -> None:
         """Go on with what is left of the jumps of the channels that are back; of AT alone even if that is nothing."""
-        left = {name: jump for name, jump in self.jumps.items() if jump.left_k} or self.jumps
-        self.jumps = {
-            name: ChannelJump(size_k=jump.left_k, std_k=jump.std_k, first_k=jump.left_k) for name, jump in left.items()
-        }
-        self.start_counts()
+        left = {name: jump.left_k for name, jump in self.jumps.items() if jump.left_k}
+        self._keep(left or dict.fromkeys(self.jumps, 0.0))
 
     def keep_as_used(self) -> None:
         """Go on with the jumps from before they were used; a channel that has only come and gone is in none."""
-        kept = self.kept_k()
+        self._keep({name: size for name, size in self.kept_k().items() if size})
+
+    def _keep(self, sizes_k: Mapping[str, float]) -> None:
         self.jumps = {
-            name: ChannelJump(size_k=kept[name], std_k=jump.std_k, first_k=kept[name])
-            for name, jump in self.jumps.items()
-            if kept[name]
+            name: ChannelJump(size_k=size, std_k=self.jumps[name].std_k, first_k=size) for name, size in sizes_k.items()
         }
         self.start_counts()
 
