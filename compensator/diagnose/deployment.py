@@ -222,6 +222,6 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
     """
     base_um, own_um = in_free_run(found)
-    is_late = found.explains and late_term(found.selection.fit) is not None
+    is_late = found.explains and found.left_in is None and late_term(found.selection.fit) is not None
     is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else WORSE) * base_um
     return (base_um, own_um) if is_worse else None

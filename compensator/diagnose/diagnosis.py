@@ -23,7 +23,7 @@ from compensator.diagnose.deployment import deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, in_free_run
-from compensator.diagnose.fit import Term, fit_terms
+from compensator.diagnose.fit import Term, fit_terms, response
 from compensator.diagnose.found_effect import FoundEffect, described, no_further_than_seen, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
@@ -232,7 +232,8 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     if few:
         errors = with_time_errors(found.fit, errors)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
-        signal = found.responses[i]
+        is_left_in = term is found.left_in
+        signal = response(evidence, term) if is_left_in else found.responses[i]
 
         def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
             return deciding.best(selection.fit, rival.fit, (label(first), label(rival.term)))
@@ -246,10 +247,11 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
                 term=term,
                 effect=effect,
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
-                rms_after_um=after,
+                rms_after_um=rms_without([*found.responses, signal]) if is_left_in else after,
                 signal=signal,
                 rivals=rivals_of(term, rivals, chosen, test),
                 replaced=not found.explains,
+                left_in=is_left_in,
             )
         )
     return tuple(sorted(effects, key=lambda effect: -effect.rms_before_um))
@@ -307,7 +309,11 @@ def _with_deviation(
     evidence, deploys = found.search.evidence, extended is not model
     # What depends on time alone is an error of the measurement: it is not in the machine that the model runs on.
     of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
-    kept_out = [effect.signal[evidence.used] for effect in of_machine if not (deploys and effect.effect.deployable)]
+    kept_out = [
+        effect.signal[evidence.used]
+        for effect in of_machine
+        if effect.left_in or not (deploys and effect.effect.deployable)
+    ]
     left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
     is_approximate = found.refitted is not None or not found.search.points.is_exact
     if deploys and is_approximate and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:

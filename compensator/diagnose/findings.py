@@ -11,7 +11,7 @@ from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN, MOSTLY
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, as_deployed, late_term, settled
+from compensator.diagnose.fit import Fit, Term, as_deployed, fit_terms, late_term, response, settled
 from compensator.diagnose.foresight import Foresight, foreseeing
 from compensator.diagnose.own_error import foretelling, own_error, own_error_alone
 from compensator.diagnose.scan import Grid
@@ -56,6 +56,8 @@ class Findings:
         The base's paths fitted together with the named effects, where nothing was known of them.
     foresight : Foresight or None
         How the drive moves, where a late T_Q was found.
+    left_in : Term or None
+        A late T_Q that is named and not corrected; it adds nothing to y in `responses`.
     """
 
     search: Search
@@ -71,6 +73,7 @@ class Findings:
     refitted: Regressed | None
     foresight: Foresight | None = None
     confirmed: float = 1.0
+    left_in: Term | None = None
 
     @property
     def named(self) -> Vector:
@@ -143,13 +146,15 @@ def findings_of(
     foresight : Foresight, optional
         How the drive moves, by a search over all data that found a late T_Q.
     """
-    found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight)
+    found = _with_late_that_helps(_findings_of(evidence, grid, unobserved=unobserved, foresight=foresight))
     if evidence.is_sparse or all(term.effect.observed for term in found.terms):
         return found
     base_um, own_um = in_free_run(found)
     if own_um <= base_um and not _is_surpassed(found):
         return found
-    shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
+    shown = _with_late_that_helps(
+        _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
+    )
     rms = found.search.criterion.rms
     nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
     if left < hidden:
@@ -245,6 +250,27 @@ def _findings_of(
         refitted=refitted,
         foresight=foresight,
     )
+
+
+def _with_late_that_helps(found: Findings) -> Findings:
+    """Return findings whose late T_Q is left in where its correction makes more errors than it removes.
+
+    That acts at every change of the heat, on this record as on others. The other effects are then those of T_Q as it
+    is. A late T_Q alone is judged with everything that is deployed (`deployment.py`).
+    """
+    late, evidence = late_term(found.fit), found.search.evidence
+    others = [term for term in found.fit.terms if term is not late]
+    if late is None or evidence.is_sparse or not any(term.effect.deployable for term in others):
+        return found
+    likelihood = found.fit.likelihood
+    beside = iter(fit_terms(likelihood, [term.start for term in others]).terms)
+    terms = tuple(late if term is late else next(beside) for term in found.fit.terms)
+    nothing = np.zeros(evidence.used.size)
+    responses = tuple(nothing if term is late else response(evidence, term) for term in terms)
+    left_in = dataclasses.replace(
+        found, terms=terms, responses=responses, remainder=None, belongs=False, explains=True, left_in=late
+    )
+    return left_in if in_free_run(left_in)[1] <= in_free_run(found)[1] else found
 
 
 def in_free_run(found: Findings) -> tuple[float, float]:

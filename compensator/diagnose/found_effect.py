@@ -24,6 +24,8 @@ from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
 REPLACED = " A regularised response does better than the names, so the remainder is deployed in its place."
+#: Said of a late T_Q that is left in.
+LEFT_IN = " On this record that correction makes more errors than it removes, so T_Q is used as it is."
 #: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
 #: evidence is smaller by no more than this: four times what decides, since forms are known approximately only.
 RIVAL_TIMES, RIVAL_EVIDENCE = 1.2, 20.0
@@ -49,6 +51,8 @@ class FoundEffect:
         What explains it nearly as well.
     replaced : bool
         Whether the remainder is deployed in its place, since it explains the data better.
+    left_in : bool
+        Whether it is a late T_Q whose correction is not deployed, since the model is better without it.
     """
 
     term: Term = field(repr=False)
@@ -58,6 +62,7 @@ class FoundEffect:
     signal: Vector = field(repr=False)
     rivals: tuple[Rival, ...] = field(repr=False)
     replaced: bool = False
+    left_in: bool = False
 
     def __getitem__(self, key: str) -> Any:
         return getattr(self, key)
@@ -110,13 +115,13 @@ class FoundEffect:
     @property
     def explanation(self) -> str:
         """For an engineer."""
-        words = self.effect.explanation
+        words = self.effect.explanation + LEFT_IN * self.left_in
         return words.replace(NEEDS_CHANNEL, "") + REPLACED if self.replaced else words
 
     @property
     def deployable(self) -> bool:
         """Whether the service can run it."""
-        return self.effect.deployable and not self.replaced
+        return self.effect.deployable and not self.replaced and not self.left_in
 
     @property
     def is_determined(self) -> bool:

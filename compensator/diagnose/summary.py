@@ -404,7 +404,7 @@ def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Expl
     """Return the explanation of an effect, and whether the extended model has it."""
     if diagnosis.deploys(effect):
         deploy = "Deployed in the extended model."
-    elif effect.replaced:
+    elif effect.effect.deployable and not effect.deployable:
         deploy = "Not in the extended model."
     elif effect.deployable:
         deploy = "Not deployed: the model was left unchanged."

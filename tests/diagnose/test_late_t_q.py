@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.data.runs import Run
+from compensator.diagnose import foresight
 from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
 from compensator.diagnose.evidence import evidence_of
@@ -171,6 +172,27 @@ def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
     gain = next(e for e in found.effects if e.kind == "gain")
     assert gain.named["change"] == pytest.approx(-0.2, abs=0.02)
     assert removed(found, [late], [weaker]) > 0.95
+
+
+def test_a_correction_that_does_harm_is_left_out_and_what_stands_beside_it_is_deployed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # A drive that is expected to hardly move: what the engine makes of the dead time is worse than the dead time.
+    monkeypatch.setattr(foresight, "_best", lambda evidence, late: foresight.Foresight(walk_times=0.01))
+    late = sensor(0.0, 3.0)
+    weaker = Scenario(place=("gain", "DTF", ""), act=lambda s: -0.2 * s[4])
+    found = diagnose(QUILL, runs_from(record([late, weaker], 1101, 24.0)[0]))
+    gain, delay = found.effects
+    assert [gain.place, delay.place] == [("gain", "DTF", ""), PLACE]
+    assert [effect.kind for effect in found.model.effects] == ["gain"]
+    assert found.deploys(gain) and not found.deploys(delay)
+    assert "T_Q is used as it is" in delay.explanation and "T_Q is used as it is" not in gain.explanation
+    # Known with the future it explains all that is left, and what it leaves in is stated and looked for no further.
+    assert delay.rms_after_um < 0.3 * delay.rms_before_um
+    assert found.verdict == "partly_explained"
+    assert found.model.y_std_um == pytest.approx(gain.rms_after_um, rel=0.3)
+    assert found.after.rms_um == pytest.approx(gain.rms_after_um, rel=0.1)
+    assert removed(found, [late], [weaker]) > 0.85
 
 
 def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
