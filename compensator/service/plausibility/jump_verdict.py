@@ -60,17 +60,8 @@ class Verdict(msgspec.Struct, frozen=True):
     has_returned: bool = False
 
 
-def suspected(
-    engine: Engine,
-    engines: JumpEngines,
-    state: JumpState,
-    offered: Mapping[str, float],
-    others: Mapping[str, float],
-    grown_y: GrownY,
-    *,
-    is_alone: bool,
-) -> Verdict:
-    """Decide whether channels that are not used are used again, and from which engine on.
+class JumpJudge:
+    """Decides what a sample has shown.
 
     Parameters
     ----------
@@ -82,153 +73,145 @@ def suspected(
         State of the watch.
     offered : mapping of str to float
         Measured temperatures, °C.
-    others : mapping of str to float
-        Usable values of the auxiliary channels.
-    grown_y : GrownY
-        Deformation by measured Y.
-    is_alone : bool
-        Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
     """
-    needed = needed_samples(state)
-    was_used = is_alone and state.phase == Phase.SUSPECT_AFTER_USE
-    if was_used and state.as_used >= needed and any(state.kept_k().values()):
-        used = _use_as_before(engine, engines, state, offered, others, grown_y)
-        if used is not None:
-            return used
-    if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
-        if state.leaves_something and is_unsteady(state):
-            return _settle(engine, engines, state, offered) if is_alone else Verdict()
-        if state.leaves_something:
-            return _keep_what_is_left(engine, engines, state, offered, is_alone=is_alone)
-        found = _accept(engine, engines, state, offered, engines.shifted, "has returned to what was expected before")
-        return msgspec.structs.replace(found, has_returned=True)
-    if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
-        return _accept(engine, engines, state, offered, None, "has returned to where it was before")
-    by = confirmed_by(state)
-    if by:
-        return _accept(engine, engines, state, offered, engines.believing, f"is used again: {by} with it")
-    if is_alone and is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
-        return _settle(engine, engines, state, offered)
-    if is_alone and is_good_enough(state) and not any(map(math.isnan, offered.values())):
-        return _settle(engine, engines, state, offered, FITS)
-    return Verdict()
 
+    def __init__(self, engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> None:
+        self._engine, self._engines, self._state, self._offered = engine, engines, state, offered
 
-def _use_as_before(
-    engine: Engine,
-    engines: JumpEngines,
-    state: JumpState,
-    offered: Mapping[str, float],
-    others: Mapping[str, float],
-    grown_y: GrownY,
-) -> Verdict | None:
-    """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then.
+    def suspected(self, others: Mapping[str, float], grown_y: GrownY, *, is_alone: bool) -> Verdict:
+        """Decide whether channels that are not used are used again, and from which engine on.
 
-    Not where measured Y contradicts them: it may show in hindsight what was wrong. Then nothing is changed.
-    """
-    before = engine.snapshot()
-    estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
-    if contradicts(grown_y.by_level, grown_y.level_std_um, estimate, engines.zero_in_use):
-        engine.restore(before)
-        return None
-    names = list(state.jumps)
-    state.keep_as_used()
-    state.phase = Phase.UNCONFIRMED
-    state.start_evidence()
-    engines.believe_from_used(engine)
-    engines.believing.estimate = estimate
-    notes = [unconfirmed_note(name, jump.size_k, AS_USED) for name, jump in state.jumps.items()]
-    return Verdict(estimate, notes, {name: offered[name] for name in names})
-
-
-def _keep_what_is_left(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], *, is_alone: bool = True
-) -> Verdict:
-    """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
-    used = {name: offered[name] for name, jump in state.jumps.items() if not jump.left_k}
-    # How far it had jumped was as uncertain as what was expected then.
-    is_certain = any(abs(jump.left_k) > NEAR * jump.std_k for jump in state.jumps.values())
-    state.keep_what_is_left()
-    engines.believing.estimate = estimate = engines.give(engine, engines.shifted)
-    engines.believe_from_shifted()
-    state.suspect()
-    if is_alone and not is_certain:
-        state.phase = Phase.UNCONFIRMED
-        notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
-        return Verdict(estimate, notes, {name: offered[name] for name in state.jumps} | used)
-    then = f"{LEFT}, and is not used until its new value is confirmed"
-    notes = [jump_note(name, jump.size_k, then) for name, jump in state.jumps.items()]
-    return Verdict(estimate, notes, used)
-
-
-def _settle(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], when: str = RESTED
-) -> Verdict:
-    """Use a channel of which it is not known whether it is right: it is unconfirmed."""
-    notes = []
-    for name, jump in state.jumps.items():
-        expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
-        jump.size_k = offered[name] - expected
-        notes.append(unconfirmed_note(name, jump.size_k, when))
-    estimate = engines.give(engine, engines.believing)
-    state.phase = Phase.UNCONFIRMED
-    state.start_evidence()
-    return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
-
-
-def _accept(
-    engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float], run: Run | None, how: str
-) -> Verdict:
-    names = list(state.jumps)
-    notes = [accepted_note(name, state.jumps[name].size_k, how) for name in names]
-    estimate = engines.give(engine, run) if run is not None else None
-    return Verdict(estimate, notes, {name: offered[name] for name in names}, ends=True)
-
-
-def watched(engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> Verdict:
-    """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor.
-
-    Parameters
-    ----------
-    engine, engines, state, offered
-        As `suspected` has them.
-    """
-    is_refuted, only_at = is_unlikely(state), state.is_at_alone
-    # What is used may be where it was for a moment because heat is switched; a jump that is watched is over at once.
-    is_back = state.is_back(needed_samples(state) if state.phase == Phase.UNCONFIRMED else 1)
-    if only_at and is_refuted and not is_back and not state.is_unconfirmed:
-        state.phase = Phase.AIR
-        return Verdict(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
-    # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
-    is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
-    if state.is_unconfirmed:
+        Parameters
+        ----------
+        others : mapping of str to float
+            Usable values of the auxiliary channels.
+        grown_y : GrownY
+            Deformation by measured Y.
+        is_alone : bool
+            Whether the other channel is not in question: beside one that is, nothing is used unconfirmed.
+        """
+        engines, state, offered = self._engines, self._state, self._offered
+        needed = needed_samples(state)
+        was_used = is_alone and state.phase == Phase.SUSPECT_AFTER_USE
+        if was_used and state.as_used >= needed and any(state.kept_k().values()):
+            used = self._use_as_before(others, grown_y)
+            if used is not None:
+                return used
+        if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
+            if state.leaves_something and is_unsteady(state):
+                return self._settle() if is_alone else Verdict()
+            if state.leaves_something:
+                return self._keep_what_is_left(is_alone=is_alone)
+            found = self._accept(engines.shifted, "has returned to what was expected before")
+            return msgspec.structs.replace(found, has_returned=True)
+        if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
+            return self._accept(None, "has returned to where it was before")
         by = confirmed_by(state)
         if by:
-            return _accept(engine, engines, state, offered, None, f"is confirmed: {by} with it")
-        if state.is_back(needed_samples(state)):
-            if only_at and state.leaves_something:
-                state.keep_what_is_left()
-            elif (only_at or not is_unsteady(state)) and not state.leaves_something and engines.agree():
-                return _accept(engine, engines, state, offered, None, "has returned to what was expected before")
-        # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
-        is_refuted |= is_contradicted(state) and not is_unsteady(state)
-    if is_refuted:
-        estimate = engines.give(engine, engines.shifted)
-        if not is_back:
-            notes = [jump_note(name, jump.size_k) for name, jump in state.jumps.items()]
-            state.suspect()
+            return self._accept(engines.believing, f"is used again: {by} with it")
+        if is_alone and is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
+            return self._settle()
+        if is_alone and is_good_enough(state) and not any(map(math.isnan, offered.values())):
+            return self._settle(FITS)
+        return Verdict()
+
+    def watched(self) -> Verdict:
+        """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor."""
+        engines, state, offered = self._engines, self._state, self._offered
+        is_refuted, only_at = is_unlikely(state), state.is_at_alone
+        # What is used may be where it was for a moment because heat is switched; a watched jump is over at once.
+        is_back = state.is_back(needed_samples(state) if state.phase == Phase.UNCONFIRMED else 1)
+        if only_at and is_refuted and not is_back and not state.is_unconfirmed:
+            state.phase = Phase.AIR
+            return Verdict(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
+        # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
+        is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
+        if state.is_unconfirmed:
+            by = confirmed_by(state)
+            if by:
+                return self._accept(None, f"is confirmed: {by} with it")
+            if state.is_back(needed_samples(state)):
+                if only_at and state.leaves_something:
+                    state.keep_what_is_left()
+                elif (only_at or not is_unsteady(state)) and not state.leaves_something and engines.agree():
+                    return self._accept(None, "has returned to what was expected before")
+            # Of a loose contact the shifted engine is no hypothesis: where it agrees with Y, it does by chance.
+            is_refuted |= is_contradicted(state) and not is_unsteady(state)
+        if is_refuted:
+            estimate = engines.give(self._engine, engines.shifted)
+            if not is_back:
+                notes = [jump_note(name, jump.size_k) for name, jump in state.jumps.items()]
+                state.suspect()
+                return Verdict(estimate, notes)
+            if state.leaves_something and not only_at:
+                return self._keep_what_is_left()
+            notes = [jump_note(name, jump.size_k, "and has returned") for name, jump in state.jumps.items()]
+            if not only_at or (engines.agree() and not state.leaves_something):
+                return Verdict(estimate, notes, ends=True)
+            # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
+            engines.swap()
+            state.keep_what_is_left()
+            state.phase = Phase.AIR_RETURNED
+            state.start_evidence()
             return Verdict(estimate, notes)
-        if state.leaves_something and not only_at:
-            return _keep_what_is_left(engine, engines, state, offered)
-        notes = [jump_note(name, jump.size_k, "and has returned") for name, jump in state.jumps.items()]
-        if not only_at or (engines.agree() and not state.leaves_something):
-            return Verdict(estimate, notes, ends=True)
-        # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
-        engines.swap()
-        state.keep_what_is_left()
-        state.phase = Phase.AIR_RETURNED
+        if math.isnan(offered["t_q_degc"]):
+            state.samples -= 1  # nothing but T_Q speaks for or against AT
+        return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
+
+    def _use_as_before(self, others: Mapping[str, float], grown_y: GrownY) -> Verdict | None:
+        """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then.
+
+        Not where measured Y contradicts them: it may show in hindsight what was wrong. Then nothing is changed.
+        """
+        engine, engines, state, offered = self._engine, self._engines, self._state, self._offered
+        before = engine.snapshot()
+        estimate = engine.step(offered["t_q_degc"], offered["at_degc"], others)
+        if contradicts(grown_y.by_level, grown_y.level_std_um, estimate, engines.zero_in_use):
+            engine.restore(before)
+            return None
+        names = list(state.jumps)
+        state.keep_as_used()
+        state.phase = Phase.UNCONFIRMED
         state.start_evidence()
-        return Verdict(estimate, notes)
-    if math.isnan(offered["t_q_degc"]):
-        state.samples -= 1  # nothing but T_Q speaks for or against AT
-    return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
+        engines.believe_from_used(engine)
+        engines.believing.estimate = estimate
+        notes = [unconfirmed_note(name, jump.size_k, AS_USED) for name, jump in state.jumps.items()]
+        return Verdict(estimate, notes, {name: offered[name] for name in names})
+
+    def _keep_what_is_left(self, *, is_alone: bool = True) -> Verdict:
+        """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
+        engines, state, offered = self._engines, self._state, self._offered
+        used = {name: offered[name] for name, jump in state.jumps.items() if not jump.left_k}
+        # How far it had jumped was as uncertain as what was expected then.
+        is_certain = any(abs(jump.left_k) > NEAR * jump.std_k for jump in state.jumps.values())
+        state.keep_what_is_left()
+        engines.believing.estimate = estimate = engines.give(self._engine, engines.shifted)
+        engines.believe_from_shifted()
+        state.suspect()
+        if is_alone and not is_certain:
+            state.phase = Phase.UNCONFIRMED
+            notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
+            return Verdict(estimate, notes, {name: offered[name] for name in state.jumps} | used)
+        then = f"{LEFT}, and is not used until its new value is confirmed"
+        notes = [jump_note(name, jump.size_k, then) for name, jump in state.jumps.items()]
+        return Verdict(estimate, notes, used)
+
+    def _settle(self, when: str = RESTED) -> Verdict:
+        """Use a channel of which it is not known whether it is right: it is unconfirmed."""
+        engines, state, offered = self._engines, self._state, self._offered
+        notes = []
+        for name, jump in state.jumps.items():
+            expected, _ = expected_value(engines.shifted.engine, name, offered["at_degc"])
+            jump.size_k = offered[name] - expected
+            notes.append(unconfirmed_note(name, jump.size_k, when))
+        estimate = engines.give(self._engine, engines.believing)
+        state.phase = Phase.UNCONFIRMED
+        state.start_evidence()
+        return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
+
+    def _accept(self, run: Run | None, how: str) -> Verdict:
+        engines, state, offered = self._engines, self._state, self._offered
+        names = list(state.jumps)
+        notes = [accepted_note(name, state.jumps[name].size_k, how) for name in names]
+        estimate = engines.give(self._engine, run) if run is not None else None
+        return Verdict(estimate, notes, {name: offered[name] for name in names}, ends=True)

@@ -37,7 +37,7 @@ from compensator.service.plausibility.jump_signs import (
     unconfirmed_note,
 )
 from compensator.service.plausibility.jump_state import JumpState, Phase
-from compensator.service.plausibility.jump_verdict import Verdict, suspected, watched
+from compensator.service.plausibility.jump_verdict import JumpJudge, Verdict
 
 
 class Judgement(msgspec.Struct, frozen=True):
@@ -439,10 +439,11 @@ class OneJump:
         others: Mapping[str, float],
         grown_y: GrownY,
     ) -> Verdict:
+        judge = JumpJudge(engine, engines, self.state, offered)
         if not self.state.is_suspect:
-            return watched(engine, engines, self.state, offered)
+            return judge.watched()
         is_alone = self._beside is None or not self._beside.is_open
-        return suspected(engine, engines, self.state, offered, others, grown_y, is_alone=is_alone)
+        return judge.suspected(others, grown_y, is_alone=is_alone)
 
     def _finish(
         self,
