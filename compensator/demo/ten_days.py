@@ -146,7 +146,8 @@ def _samples(
     if is_probed:
         at = np.arange(PROBE_EVERY_MIN, len(table), PROBE_EVERY_MIN)
         noise = np.random.default_rng([PROBE_SEED, seed]).normal(0.0, TOUCH_STD_UM, at.size)
-        shown[at] = record.true_um[at - 1] - record.true_um[0] + noise
+        # In the middle of the minute that the next sample is the mean of.
+        shown[at] = record.true_um[at] - record.true_um[0] + noise
     return [
         (
             sample_of(

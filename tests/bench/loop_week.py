@@ -85,7 +85,8 @@ def samples_of(week, columns, true_um):
     shown = np.full(week.minutes, math.nan)
     for probe in week.probes:
         zero = zeros[np.searchsorted(zeros, probe.minute) - 1]
-        shown[probe.minute] = true_um[probe.minute - 1] - true_um[zero] + probe.error_um
+        # In the middle of the minute that the next sample is the mean of.
+        shown[probe.minute] = true_um[probe.minute] - true_um[zero] + probe.error_um
     names = list(columns)
     table = np.column_stack([columns[name] for name in names])
     return [

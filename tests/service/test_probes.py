@@ -646,14 +646,15 @@ def past(*values: tuple[float, float, float]) -> list[PastSample]:
 
 def test_a_time_between_two_samples_is_between_their_predictions() -> None:
     samples = past((1, 10.0, -10.0), (2, 12.0, -12.0), (5, 20.0, math.nan))
-    found = predicted_at(samples, round(1.25 * MINUTE_NS), 60.0)
+    # A prediction belongs to the middle of its minute.
+    found = predicted_at(samples, round(0.75 * MINUTE_NS), 60.0)
     assert found is not None and found.y_um == pytest.approx(10.5)
     assert found.contributions_um == pytest.approx((10.5, 0.0))
     # Before the first, in a gap, and just behind its edge, where the rate foretells it.
-    assert predicted_at(samples, round(0.9 * MINUTE_NS), 60.0) is None
+    assert predicted_at(samples, round(0.4 * MINUTE_NS), 60.0) is None
     assert predicted_at(samples, round(3.5 * MINUTE_NS), 60.0) is None
     behind = predicted_at(samples, round(2.5 * MINUTE_NS), 60.0)
-    assert behind is not None and behind.y_um == pytest.approx(12.5)
+    assert behind is not None and behind.y_um == pytest.approx(13.0)
     assert predicted_at(samples, round(6.6 * MINUTE_NS), 60.0) is None
 
 

@@ -1,7 +1,8 @@
 """The last samples: what was predicted at the time of a probe, and which offset was published then.
 
-A probe is a point in time; the prediction goes from sample to sample, each at its end. That is when its offset is
-published, which is then followed with its rate (`compensator.receiver`): a probe shows what this offset leaves.
+A probe is a point in time. A sample is a mean over its period, and its prediction belongs to the middle of that. At its
+end its offset is published, which is then followed with its rate (`compensator.receiver`): a probe shows what this
+offset leaves.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ class Predicted:
 def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -> Predicted | None:
     """Return what the model predicted for a time; None if there is no prediction for it."""
     period_ns = round(period_s * NS)
+    # The end of a period in whose middle it is.
+    time_ns += period_ns // 2
     after = next((i for i, sample in enumerate(samples) if sample.time_ns > time_ns), len(samples))
     if after == 0:
         return None
@@ -46,7 +49,7 @@ def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -
             max(before.noise_um, later.noise_um),
         )
     ahead_ns = time_ns - before.time_ns
-    if ahead_ns > (1.0 if has_gap else _GAP) * period_ns:
+    if ahead_ns > ((1.0 if has_gap else _GAP) + 0.5) * period_ns:
         return None
     return Predicted(
         before.y_um + before.rate_um_per_min * ahead_ns / (60.0 * NS), before.contributions_um, before.noise_um
