@@ -13,6 +13,7 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.axes import FIRST
+from compensator.clock import NS
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import ModelError
@@ -170,7 +171,7 @@ class Compensation(Continuity):
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
             self.outputs.remember(estimate, MEAN_SAMPLES)
-            self._remember_sample(raw.time_utc_ns, estimate)
+            self._remember_sample(raw, estimate)
         decided = self._decide_probes(raw, notes)
         prediction = self._prediction() if estimate else Prediction()
         y_pred = prediction.y_um
@@ -228,12 +229,14 @@ class Compensation(Continuity):
             if self.probing is not None:
                 self.probing.move_zero(before.contributions_um, now.contributions_um)
 
-    def _remember_sample(self, time_ns: int, estimate: Estimate) -> None:
+    def _remember_sample(self, raw: Sample, estimate: Estimate) -> None:
         """Keep what a probe of this time is compared with."""
         if self.probing is not None:
+            # Each poll is at the end of its part of the sample.
+            polls = max([1, *(channel.polls for channel in raw.channels.values())])
             self.probing.add(
                 PastSample(
-                    time_ns=time_ns,
+                    time_ns=raw.time_utc_ns,
                     y_um=estimate.y_um - self._zero.y_base,
                     rate_um_per_min=estimate.y_rate_um_per_min,
                     contributions_um=estimate.contributions_um,
@@ -241,6 +244,7 @@ class Compensation(Continuity):
                     offset_um=NAN,
                     offset_rate_um_per_min=NAN,
                     is_held=False,
+                    behind_ns=round(0.5 * (1.0 - 1.0 / polls) * raw.period_s * NS),
                 )
             )
 

@@ -641,12 +641,15 @@ async def test_a_correction_at_its_limit_is_a_reason(tmp_path: Path) -> None:
 
 def past(*values: tuple[float, float, float]) -> list[PastSample]:
     """Samples with minute, prediction and offset; the rate is 1 µm/min."""
-    return [PastSample(round(t * MINUTE_NS), y, 1.0, (y, 0.0), 0.1, offset, -1.0, False) for t, y, offset in values]
+    return [
+        PastSample(round(t * MINUTE_NS), y, 1.0, (y, 0.0), 0.1, offset, -1.0, False, MINUTE_NS // 2)
+        for t, y, offset in values
+    ]
 
 
 def test_a_time_between_two_samples_is_between_their_predictions() -> None:
     samples = past((1, 10.0, -10.0), (2, 12.0, -12.0), (5, 20.0, math.nan))
-    # A prediction belongs to the middle of its minute.
+    # A prediction belongs to the middle of its minute, its offset to the end.
     found = predicted_at(samples, round(0.75 * MINUTE_NS), 60.0)
     assert found is not None and found.y_um == pytest.approx(10.5)
     assert found.contributions_um == pytest.approx((10.5, 0.0))
@@ -656,6 +659,20 @@ def test_a_time_between_two_samples_is_between_their_predictions() -> None:
     behind = predicted_at(samples, round(2.5 * MINUTE_NS), 60.0)
     assert behind is not None and behind.y_um == pytest.approx(13.0)
     assert predicted_at(samples, round(6.6 * MINUTE_NS), 60.0) is None
+
+
+@pytest.mark.parametrize(("interval_s", "behind_s"), [(60.0, 0.0), (20.0, 20.0), (1.0, 29.5)])
+async def test_a_prediction_belongs_to_the_middle_of_its_polls(
+    tmp_path: Path, interval_s: float, behind_s: float
+) -> None:
+    config = PROBED.replace(b"poll_interval_s = 60.0", f"poll_interval_s = {interval_s}".encode())
+    machine = ProbedMachine(tmp_path, config=config)
+    await machine.run(2)
+    assert machine.daemon is not None
+    state = decode_state(machine.daemon._compensation.state()).probing
+    assert state is not None
+    last = state.samples[-1]
+    assert last.time_ns - last.middle_ns == behind_s * NS
 
 
 def test_the_offset_of_a_time_is_followed_with_its_rate_and_expires() -> None:

@@ -1,8 +1,8 @@
 """The last samples: what was predicted at the time of a probe, and which offset was published then.
 
-A probe is a point in time. A sample is a mean over its period, and its prediction belongs to the middle of that. At its
-end its offset is published, which is then followed with its rate (`compensator.receiver`): a probe shows what this
-offset leaves.
+A probe is a point in time. A sample is a mean of polls, and its prediction belongs to the middle of them. At its end
+its offset is published, which is then followed with its rate (`compensator.receiver`): a probe shows what this offset
+leaves.
 """
 
 from __future__ import annotations
@@ -32,25 +32,23 @@ class Predicted:
 def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -> Predicted | None:
     """Return what the model predicted for a time; None if there is no prediction for it."""
     period_ns = round(period_s * NS)
-    # The end of a period in whose middle it is.
-    time_ns += period_ns // 2
-    after = next((i for i, sample in enumerate(samples) if sample.time_ns > time_ns), len(samples))
+    after = next((i for i, sample in enumerate(samples) if sample.middle_ns > time_ns), len(samples))
     if after == 0:
         return None
     before = samples[after - 1]
     later = samples[after] if after < len(samples) else None
     has_gap = later is not None and later.time_ns - before.time_ns > _GAP * period_ns
     if later is not None and not has_gap:
-        part = (time_ns - before.time_ns) / (later.time_ns - before.time_ns)
+        part = (time_ns - before.middle_ns) / (later.middle_ns - before.middle_ns)
         pairs = zip(before.contributions_um, later.contributions_um, strict=True)
         return Predicted(
             before.y_um + part * (later.y_um - before.y_um),
             tuple(then + part * (now - then) for then, now in pairs),
             max(before.noise_um, later.noise_um),
         )
-    ahead_ns = time_ns - before.time_ns
-    if ahead_ns > ((1.0 if has_gap else _GAP) + 0.5) * period_ns:
+    if time_ns - before.time_ns > (1.0 if has_gap else _GAP) * period_ns:
         return None
+    ahead_ns = time_ns - before.middle_ns
     return Predicted(
         before.y_um + before.rate_um_per_min * ahead_ns / (60.0 * NS), before.contributions_um, before.noise_um
     )

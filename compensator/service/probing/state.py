@@ -25,6 +25,8 @@ class PastSample(msgspec.Struct, frozen=True, array_like=True):
         As published; NaN until then.
     is_held : bool
         Whether the offset was held.
+    behind_ns : int
+        How far the middle of its polls is before its end, ns.
     """
 
     time_ns: int
@@ -35,6 +37,12 @@ class PastSample(msgspec.Struct, frozen=True, array_like=True):
     offset_um: float
     offset_rate_um_per_min: float
     is_held: bool
+    behind_ns: int = 0
+
+    @property
+    def middle_ns(self) -> int:
+        """Time that the prediction belongs to, ns since 1970 UTC."""
+        return self.time_ns - self.behind_ns
 
 
 class KnownProbe(msgspec.Struct, frozen=True, array_like=True):
