@@ -111,6 +111,12 @@ class Sample(Message, frozen=True, kw_only=True):
     period_s: PeriodS
     channels: dict[str, ChannelSample]
 
+    @property
+    def behind_ns(self) -> int:
+        """How far before its end the middle of its polls is, ns; each is at the end of its part of the sample."""
+        polls = max([1, *(channel.polls for channel in self.channels.values())])
+        return round(0.5 * (1.0 - 1.0 / polls) * self.period_s * 1e9)
+
 
 class EstimateMessage(Message, frozen=True, kw_only=True):
     """What the model makes of one sample, `/estimate` and `thermal/estimate`.

@@ -68,7 +68,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     paths = recordings_in(map(Path, given))
     rows: dict[int, dict[str, Any]] = {}
     probes: list[list[Probe]] = []
-    periods_s: dict[int, float] = {}
+    samples: dict[int, Sample] = {}
     machines: dict[str, Path] = {}
     for recording in paths:
         before = len(rows)
@@ -79,7 +79,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
                 probes[-1].append(message)
                 continue
             if isinstance(message, Sample):
-                periods_s[message.seq] = message.period_s
+                samples[message.seq] = message
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
@@ -87,7 +87,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         (one, first), (other, second) = list(machines.items())[:2]
         raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
     rows = dict(sorted(rows.items()))
-    _add_probes(str(paths[0]), rows, probes, periods_s)
+    _add_probes(str(paths[0]), rows, probes, samples)
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
@@ -107,20 +107,23 @@ def _messages(recording: Path, machine: str) -> Iterator[Any]:
 
 
 def _add_probes(
-    name: str, rows: dict[int, dict[str, Any]], recorded: Sequence[Sequence[Probe]], periods_s: dict[int, float]
+    name: str, rows: dict[int, dict[str, Any]], recorded: Sequence[Sequence[Probe]], samples: dict[int, Sample]
 ) -> None:
-    """Add `y_um` to the rows in whose time a probe was measured; a probe outside of all samples is left out."""
+    """Add `y_um` to the rows around the middle of whose polls a probe was measured; one outside of all is left out."""
     if not any(recorded) or any(row.get("y_um") is not None for row in rows.values()):
         return
     probes, remarks = measured_probes(name, recorded)
     for remark in remarks:
         log.warning("%s", remark.marked)
-    ends = sorted((rows[seq]["_ns"], seq) for seq in periods_s)
+    # From half a period before the middle of its polls on.
+    begins = sorted(
+        (one.time_utc_ns - one.behind_ns - round(0.5e9 * one.period_s), seq) for seq, one in samples.items()
+    )
     values: defaultdict[int, list[float]] = defaultdict(list)
     for probe in probes:
-        i = bisect.bisect_left(ends, (probe.time_utc_ns, 0))
-        if i < len(ends) and ends[i][0] - probe.time_utc_ns < periods_s[ends[i][1]] * 1e9:
-            values[ends[i][1]].append(number(probe.deformation_um))
+        i = bisect.bisect_left(begins, (probe.time_utc_ns, 0)) - 1
+        if i >= 0 and probe.time_utc_ns - begins[i][0] <= samples[begins[i][1]].period_s * 1e9:
+            values[begins[i][1]].append(number(probe.deformation_um))
     for row in rows.values():
         row.setdefault("y_um", None)
     for seq, measured in values.items():

@@ -13,7 +13,6 @@ import msgspec
 
 from compensator.arrays import NAN
 from compensator.axes import FIRST
-from compensator.clock import NS
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import ModelError
@@ -232,8 +231,6 @@ class Compensation(Continuity):
     def _remember_sample(self, raw: Sample, estimate: Estimate) -> None:
         """Keep what a probe of this time is compared with."""
         if self.probing is not None:
-            # Each poll is at the end of its part of the sample.
-            polls = max([1, *(channel.polls for channel in raw.channels.values())])
             self.probing.add(
                 PastSample(
                     time_ns=raw.time_utc_ns,
@@ -244,7 +241,7 @@ class Compensation(Continuity):
                     offset_um=NAN,
                     offset_rate_um_per_min=NAN,
                     is_held=False,
-                    behind_ns=round(0.5 * (1.0 - 1.0 / polls) * raw.period_s * NS),
+                    behind_ns=raw.behind_ns,
                 )
             )
 

@@ -136,3 +136,23 @@ async def test_each_recording_says_by_itself_whether_the_control_applied_nothing
     with (tmp_path / "both.csv").open() as file:
         exported = [float(row["y_um"]) for row in csv.DictReader(file) if row["y_um"]]
     assert exported == pytest.approx(read_y[np.isfinite(read_y)])
+
+
+async def test_a_probe_belongs_to_the_sample_whose_polls_are_around_it(tmp_path: Path) -> None:
+    """The label of a sample is its end, and the mean of its polls half a minute older."""
+    machine = ProbedMachine(tmp_path, config=PROBED.replace(b"poll_interval_s = 60.0", b"poll_interval_s = 10.0"))
+    polls = iter(range(1, 700))
+    probed = {6 * 70 + 1, 6 * 80 + 3, 6 * 90 + 5}  # 10, 30 and 50 s after a sample
+
+    def at_poll() -> None:
+        if next(polls) in probed:
+            machine.probe()
+
+    machine.at_poll = at_poll
+    await machine.run(100)
+    assert machine.codes() == ["taken"] * 3
+    out = tmp_path / "all.csv"
+    tc.export(recordings(machine.recordings, MACHINE), out)
+    for one in (recordings(machine.recordings, MACHINE), out):
+        (record,) = tc.read(one).at_period(60.0).records
+        assert np.flatnonzero(np.isfinite(record.columns["y_um"])).tolist() == [70, 80, 90]

@@ -31,7 +31,8 @@ BEFORE_H = 1.0
 def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
     """Return outcomes as the table of a diagnosis; the time counts from 1970.
 
-    Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own time.
+    Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own, whose time is
+    the end of the polls in whose middle it was.
     """
     return table_of_rows(
         [(outcome.sample, outcome.offset) for outcome in record],
@@ -72,7 +73,8 @@ def table_of_rows(
         y = np.where(np.isin(t_s, left_out), np.nan, y)
     columns["y_um"] = y
     if not np.isfinite(y).any():
-        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns))
+        behind_ns = rows[0][0].behind_ns if rows else 0
+        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
     return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
 
 
@@ -106,8 +108,10 @@ def _usable(
     return max(reversed(groups.values()), key=len, default=[])
 
 
-def _with_probes(t_s: Vector, columns: dict[str, Vector], probes: Sequence[Probe]) -> tuple[Vector, dict[str, Vector]]:
-    blank, times = np.full(len(probes), np.nan), [probe.time_utc_ns / NS for probe in probes]
+def _with_probes(
+    t_s: Vector, columns: dict[str, Vector], probes: Sequence[Probe], behind_ns: int
+) -> tuple[Vector, dict[str, Vector]]:
+    blank, times = np.full(len(probes), np.nan), [(probe.time_utc_ns + behind_ns) / NS for probe in probes]
     columns = {name: np.concatenate([values, blank]) for name, values in columns.items()}
     columns["y_um"][t_s.size :] = [number(probe.deformation_um) for probe in probes]
     t_s = np.concatenate([t_s, times])
