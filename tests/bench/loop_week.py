@@ -9,6 +9,7 @@ from compensator.config import parse_config
 from compensator.demo.offline import sample_of
 from compensator.messages import number
 from compensator.service.outcome import sets_zero
+from sim_hardware.drawn_machines.trouble import moved_um
 
 #: 2026-01-05T00:00:00Z.
 MIDNIGHT_NS = 1_767_571_200 * NS
@@ -82,11 +83,12 @@ def samples_of(week, columns, true_um):
         visited[minute + int(np.argmax(week.running[minute:]))] = True
     # A person who sets a zero also sets that of the feature.
     zeros = np.concatenate(([0], np.flatnonzero(visited)))
+    moved = moved_um(week.troubles, week.minutes)
     shown = np.full(week.minutes, math.nan)
     for probe in week.probes:
         zero = zeros[np.searchsorted(zeros, probe.minute) - 1]
         # In the middle of the minute that the next sample is the mean of.
-        shown[probe.minute] = true_um[probe.minute] - true_um[zero] + probe.error_um
+        shown[probe.minute] = true_um[probe.minute] - true_um[zero] + probe.error_um - (moved[zero] - moved[0])
     names = list(columns)
     table = np.column_stack([columns[name] for name in names])
     return [
