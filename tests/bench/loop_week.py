@@ -81,8 +81,10 @@ def samples_of(week, columns, true_um):
     visited = np.zeros(week.minutes, dtype=bool)
     for minute in week.visits:
         visited[minute + int(np.argmax(week.running[minute:]))] = True
-    # A person who sets a zero also sets that of the feature.
-    zeros = np.concatenate(([0], np.flatnonzero(visited)))
+    # A person who sets a zero also sets that of the feature, once the service has taken it: with both temperatures.
+    readable = np.isfinite(columns["t_q_degc"]) & np.isfinite(columns["at_degc"]) & week.running
+    taken = [minute + int(np.argmax(readable[minute:])) for minute in np.flatnonzero(visited)]
+    zeros = np.array([0, *taken])
     moved = moved_um(week.troubles, week.minutes)
     shown = np.full(week.minutes, math.nan)
     for probe in week.probes:
