@@ -18,7 +18,8 @@ bound           removed % with the true effect, adopted in the minute in which i
                 judges by the loop's measure can remove more.
 fair            for at least 36 of the 48 h nothing else was wrong, or a person had not yet seen to it: no decision is
                 made while a sensor is suspected.
-                Errors are those of the times in which both temperatures were right, and had been for 6 h.
+                Errors are those of the times in which both temperatures were right, and had been for 6 h, and no probed
+                feature had moved that a person had not seen to.
 worse           from an adoption to the next change of the model, or to the end, the error is more than 5 % and 0.05 µm
                 above that of the model before.
 reproduced      a second run, which gets the recorded results of the diagnoses, makes the same decisions with the same

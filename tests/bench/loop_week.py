@@ -117,11 +117,16 @@ def error_of(outcomes, true_um):
 
 
 def whole(week):
-    """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error."""
+    """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error.
+
+    A displacement sensor makes no error of the offset; a probed feature that has moved does, until a person has seen to it.
+    """
     found = np.ones(week.minutes, dtype=bool)
     for trouble in week.troubles:
         if trouble.channel != "y_um":
             found[trouble.from_min : trouble.to_min + AFTER_FAULT_MIN] = False
+        elif week.probes:
+            found[trouble.from_min : seen_to(week, trouble)] = False
     for minute in week.visits:
         found[minute : minute + LIMITED_MIN] = False
     return found
@@ -131,10 +136,14 @@ def undisturbed(week):
     """Return at which minutes nothing is wrong beside the machine, or has been seen to."""
     found = np.ones(week.minutes, dtype=bool)
     for trouble in week.troubles:
-        after = [minute for minute in week.visits if minute >= trouble.to_min]
-        end = after[0] if after and trouble.kind not in ("break", "period", "hand") else trouble.to_min
-        found[trouble.from_min : end] = False
+        found[trouble.from_min : seen_to(week, trouble)] = False
     return found
+
+
+def seen_to(week, trouble):
+    """Return the minute in which a person has seen to a trouble, or from which on it is over by itself."""
+    after = [minute for minute in week.visits if minute >= trouble.to_min]
+    return after[0] if after and trouble.kind not in ("break", "period", "hand") else trouble.to_min
 
 
 def rms(error):
