@@ -8,7 +8,7 @@ import logging
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,8 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     offset, its state and reasons; of a machine of several axes the same of each, such as `z_pred_um`, `z_offset_um`,
     `z_state`. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. `y_um` is as
     measured, and `y_ref_um` its value at the zero: `y_um` − `y_ref_um` counts from the zero of `y_pred_um`. Where no
-    displacement sensor measured Y, `y_um` is the deformation that a touch probe showed, at the sample of its time.
+    displacement sensor measured Y, `y_um` is the deformation that a touch probe showed, at the sample whose polls are
+    around its time.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     paths = recordings_in(map(Path, given))
     rows: dict[int, dict[str, Any]] = {}
     probes: list[list[Probe]] = []
-    samples: dict[int, Sample] = {}
+    middles: dict[int, tuple[int, int]] = {}
     machines: dict[str, Path] = {}
     for recording in paths:
         before = len(rows)
@@ -79,7 +80,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
                 probes[-1].append(message)
                 continue
             if isinstance(message, Sample):
-                samples[message.seq] = message
+                middles[message.seq] = message.time_utc_ns - message.behind_ns, round(0.5e9 * message.period_s)
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
@@ -87,7 +88,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         (one, first), (other, second) = list(machines.items())[:2]
         raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
     rows = dict(sorted(rows.items()))
-    _add_probes(str(paths[0]), rows, probes, samples)
+    _add_probes(str(paths[0]), rows, probes, middles)
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
@@ -107,22 +108,28 @@ def _messages(recording: Path, machine: str) -> Iterator[Any]:
 
 
 def _add_probes(
-    name: str, rows: dict[int, dict[str, Any]], recorded: Sequence[Sequence[Probe]], samples: dict[int, Sample]
+    name: str,
+    rows: dict[int, dict[str, Any]],
+    recorded: Sequence[Sequence[Probe]],
+    middles: Mapping[int, tuple[int, int]],
 ) -> None:
-    """Add `y_um` to the rows around the middle of whose polls a probe was measured; one outside of all is left out."""
+    """Add `y_um` to the rows around the middle of whose polls a probe was measured; one outside of all is left out.
+
+    Parameters
+    ----------
+    middles : mapping of int to (int, int)
+        By `seq`, middle of the polls of a sample and half its period, ns.
+    """
     if not any(recorded) or any(row.get("y_um") is not None for row in rows.values()):
         return
     probes, remarks = measured_probes(name, recorded)
     for remark in remarks:
         log.warning("%s", remark.marked)
-    # From half a period before the middle of its polls on.
-    begins = sorted(
-        (one.time_utc_ns - one.behind_ns - round(0.5e9 * one.period_s), seq) for seq, one in samples.items()
-    )
+    begins = sorted((middle - half, seq) for seq, (middle, half) in middles.items())
     values: defaultdict[int, list[float]] = defaultdict(list)
     for probe in probes:
         i = bisect.bisect_left(begins, (probe.time_utc_ns, 0)) - 1
-        if i >= 0 and probe.time_utc_ns - begins[i][0] <= samples[begins[i][1]].period_s * 1e9:
+        if i >= 0 and probe.time_utc_ns - begins[i][0] <= 2 * middles[begins[i][1]][1]:
             values[begins[i][1]].append(number(probe.deformation_um))
     for row in rows.values():
         row.setdefault("y_um", None)

@@ -203,8 +203,8 @@ def read_workbook(path: Path, roles: Mapping[str, str]) -> Table:
 def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read recordings that follow each other as one table; each has the columns that the roles name.
 
-    Where no displacement sensor measured Y, the values of touch probes are `y_um`, each in a row of its own, whose time
-    is the end of the polls in whose middle it was.
+    Where no displacement sensor measured Y, the values of touch probes are `y_um`, each in a row of its own: as much
+    later than the probe as the time of a sample, its end, is than the middle of its polls.
 
     Raises
     ------
@@ -230,8 +230,9 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
             values = [number(probe.deformation_um) for probe in probes]
             columns["y_um"] = np.concatenate([np.full(t_s.size, np.nan), values])
-            behind_ns = parts[0][2]
-            t_s = np.concatenate([t_s, [(probe.time_utc_ns + behind_ns) / 1e9 for probe in probes]])
+            behind_ns = {id(probe): behind for _, some, behind in parts for probe in some}
+            times = [(probe.time_utc_ns + behind_ns[id(probe)]) / 1e9 for probe in probes]
+            t_s = np.concatenate([t_s, times])
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
@@ -292,7 +293,8 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe], int]:
         if isinstance(message, Probe):
             probes.append(message)
             continue
-        behind_ns = behind_ns or message.behind_ns
+        # A sample in which the service began has fewer polls.
+        behind_ns = max(behind_ns, message.behind_ns)
         times.append(message.time_utc_ns)
         samples.append(
             {name: number(channel.mean) if channel.is_good else math.nan for name, channel in message.channels.items()}

@@ -184,7 +184,7 @@ def _by_channels(
     # What is not known, in a record without a block to hold out, confirms nothing.
     if instead is None or not rms_of(held_out.ceiling) <= min(whole_um, lowers * nothing_um):
         return found, effects, held_out
-    effects = tuple(dataclasses.replace(effect, replaced=True) for effect in effects)
+    effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
 
 

@@ -7,6 +7,7 @@ it, and what that finds is applied to the block.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -92,7 +93,7 @@ def diagnose(
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
-    places = [] if evidence.free_paths else [effect.place for effect in effects]
+    places = [] if evidence.free_paths else [effect.place for effect in effects if not effect.left_in]
     held_out = held_out_of(found, places, progress, executor_map)
     chosen = deployment_of(found, effects, held_out)
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
@@ -227,7 +228,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     after = rms_without(found.responses)
     chosen = search.criterion.compared(selection.fit), search.criterion.score(selection.fit)
     effects = []
-    errors = standard_errors(found.fit)
+    errors = _errors(found)
     few = evidence.is_sparse
     if few:
         errors = with_time_errors(found.fit, errors)
@@ -255,6 +256,22 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
             )
         )
     return tuple(sorted(effects, key=lambda effect: -effect.rms_before_um))
+
+
+def _errors(found: Findings) -> list[dict[str, float]]:
+    """Return the standard errors of each term.
+
+    Beside a late T_Q that is left in, the others are fitted to what it leaves, too: by how much that moves them counts.
+    """
+    if found.left_in is None:
+        return standard_errors(found.fit)
+    corrected, others = found.selection.fit, iter(standard_errors(found.fit))
+    return [
+        std
+        if term is found.left_in
+        else {name: math.hypot(std, term.named[name] - then.named[name]) for name, std in next(others).items()}
+        for term, then, std in zip(found.terms, corrected.terms, standard_errors(corrected), strict=True)
+    ]
 
 
 def _extended(
@@ -287,8 +304,9 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     """
     if found.refitted or not effects:
         return [effect.effect for effect in effects]
-    factors = std_factors(found.fit, found.terms, beside_own_error=found.belongs)
-    rows = dict(zip(map(id, found.terms), factors, strict=True))
+    terms = [term for term in found.terms if term is not found.left_in]
+    factors = std_factors(found.fit, terms, beside_own_error=found.belongs)
+    rows = dict(zip(map(id, terms), factors, strict=True))
     # Rows belong together by their place: those of effects that the model has already come first.
     before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
     return [
@@ -391,7 +409,7 @@ def _verdict(
         left = evidence.left(evidence.residual, added, at_rest=False)[evidence.used]
         return noise.is_explained(float(left @ left))
 
-    is_noise = leaves_noise(found.whole)
+    is_noise = leaves_noise(found.known)
     if not observed:
         if is_adequate(found, held_out):
             return "adequate", False
@@ -409,5 +427,6 @@ def _verdict(
         return rms_of(values) ** 2 < most_um2
 
     nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains and holds_in_free_run
-    by_names = leaves_noise(found.named) and holds(held_out.named) and all(e.is_determined for e in effects)
+    named = found.named + (found.known - found.whole)
+    by_names = leaves_noise(named) and holds(held_out.named) and all(e.is_determined for e in effects)
     return ("explained" if nothing_left and by_names else "partly_explained"), nothing_left

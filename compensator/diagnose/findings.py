@@ -91,6 +91,13 @@ class Findings:
         return self.channels.added
 
     @property
+    def known(self) -> Vector:
+        """What has a name or is corrected, µm: effects and remainder, and a late T_Q that is left in."""
+        if self.left_in is None:
+            return self.whole
+        return self.whole + response(self.search.evidence, self.left_in)
+
+    @property
     def leaves_noise(self) -> bool:
         """Whether the base model leaves no more than noise, with zero and initial state fitted."""
         return self.search.criterion.leaves_noise(self.selection.before)
@@ -131,7 +138,12 @@ class Findings:
 
 
 def findings_of(
-    evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None, foresight: Foresight | None = None
+    evidence: Evidence,
+    *,
+    unobserved: bool = True,
+    grid: Grid | None = None,
+    foresight: Foresight | None = None,
+    leaves_late: bool | None = None,
 ) -> Findings:
     """Search in some evidence.
 
@@ -145,16 +157,17 @@ def findings_of(
         That of a search over all data, where something is held out.
     foresight : Foresight, optional
         How the drive moves, by a search over all data that found a late T_Q.
+    leaves_late : bool, optional
+        Whether a late T_Q beside other effects is left in, by a search over all data; by default it is decided.
     """
-    found = _with_late_that_helps(_findings_of(evidence, grid, unobserved=unobserved, foresight=foresight))
+    found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight, leaves_late=leaves_late)
     if evidence.is_sparse or all(term.effect.observed for term in found.terms):
         return found
     base_um, own_um = in_free_run(found)
     if own_um <= base_um and not _is_surpassed(found):
         return found
-    shown = _with_late_that_helps(
-        _findings_of(evidence, found.search.grid, unobserved=False, foresight=found.foresight or foresight)
-    )
+    known = found.foresight or foresight
+    shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=known, leaves_late=leaves_late)
     rms = found.search.criterion.rms
     nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
     if left < hidden:
@@ -193,7 +206,9 @@ def by_channels(found: Findings) -> Findings | None:
     if found.terms and not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
         return None
     explains = not found.terms
-    instead = dataclasses.replace(found, remainder=found.channels, belongs=False, explains=explains, confirmed=1.0)
+    instead = dataclasses.replace(
+        found, remainder=found.channels, belongs=False, explains=explains, confirmed=1.0, left_in=None
+    )
     return instead if _is_no_worse(instead) else None
 
 
@@ -204,7 +219,12 @@ def _is_no_worse(found: Findings) -> bool:
 
 
 def _findings_of(
-    evidence: Evidence, grid: Grid | None, *, unobserved: bool, foresight: Foresight | None = None
+    evidence: Evidence,
+    grid: Grid | None,
+    *,
+    unobserved: bool,
+    foresight: Foresight | None,
+    leaves_late: bool | None,
 ) -> Findings:
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
@@ -236,7 +256,7 @@ def _findings_of(
         deployed = as_deployed(fit)
         remainder, belongs = own_error(deployed[2]), True
     terms, responses, _ = deployed
-    return Findings(
+    found = Findings(
         search=search,
         selection=selection,
         fit=fit,
@@ -250,27 +270,36 @@ def _findings_of(
         refitted=refitted,
         foresight=foresight,
     )
-
-
-def _with_late_that_helps(found: Findings) -> Findings:
-    """Return findings whose late T_Q is left in where its correction makes more errors than it removes.
-
-    That acts at every change of the heat, on this record as on others. The other effects are then those of T_Q as it
-    is. A late T_Q alone is judged with everything that is deployed (`deployment.py`).
-    """
-    late, evidence = late_term(found.fit), found.search.evidence
-    others = [term for term in found.fit.terms if term is not late]
-    if late is None or evidence.is_sparse or not any(term.effect.deployable for term in others):
+    # A late T_Q alone is judged with everything that is deployed (`deployment.py`).
+    late = late_term(fit)
+    has_others = any(term.effect.deployable and term is not late for term in fit.terms)
+    if late is None or not has_others or evidence.is_sparse or evidence.free_paths or leaves_late is False:
         return found
-    likelihood = found.fit.likelihood
-    beside = iter(fit_terms(likelihood, [term.start for term in others]).terms)
-    terms = tuple(late if term is late else next(beside) for term in found.fit.terms)
+    left_in = _with_late_left_in(found, late)
+    return left_in if leaves_late or in_free_run(left_in)[1] <= in_free_run(found)[1] else found
+
+
+def _with_late_left_in(found: Findings, late: Term) -> Findings:
+    """Return findings whose late T_Q is named and not corrected: the others are those of T_Q as it is."""
+    others = [term for term in found.fit.terms if term.effect.lateness is None]
+    fit = settled(fit_terms(found.fit.likelihood, [term.start for term in others]))
+    remainder: Regressed | None = None
+    if _has_own_error(fit):
+        fit = foretelling(fit)
+        remainder = own_error(fit)
+    evidence, beside = found.search.evidence, iter(fit.terms)
+    terms = tuple(late if term.effect.lateness is not None else next(beside) for term in found.terms)
     nothing = np.zeros(evidence.used.size)
-    responses = tuple(nothing if term is late else response(evidence, term) for term in terms)
-    left_in = dataclasses.replace(
-        found, terms=terms, responses=responses, remainder=None, belongs=False, explains=True, left_in=late
+    return dataclasses.replace(
+        found,
+        fit=fit,
+        terms=terms,
+        responses=tuple(nothing if term is late else response(evidence, term) for term in terms),
+        remainder=remainder,
+        belongs=remainder is not None,
+        explains=True,
+        left_in=late,
     )
-    return left_in if in_free_run(left_in)[1] <= in_free_run(found)[1] else found
 
 
 def in_free_run(found: Findings) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from compensator.diagnose.fit import Term
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
 from compensator.model.effects.base import filters
+from compensator.model.effects.delay import CORRECTED
 from compensator.model.effects.hypothesis import Place
 from compensator.model.effects.input import NEEDS_CHANNEL
 from compensator.model.effects.regression import Regression
@@ -25,7 +26,7 @@ from compensator.model.effects.seen import Range, Seen
 #: Said of an effect in whose place the remainder is deployed.
 REPLACED = " A regularised response does better than the names, so the remainder is deployed in its place."
 #: Said of a late T_Q that is left in.
-LEFT_IN = " On this record that correction makes more errors than it removes, so T_Q is used as it is."
+LEFT_IN = " A correction in real time would make more errors on this record than it removes, so T_Q is used as it is."
 #: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
 #: evidence is smaller by no more than this: four times what decides, since forms are known approximately only.
 RIVAL_TIMES, RIVAL_EVIDENCE = 1.2, 20.0
@@ -46,7 +47,7 @@ class FoundEffect:
     rms_before_um, rms_after_um : float
         Residual without it and with it, the others in place, µm.
     signal : numpy.ndarray, shape (n,)
-        What it adds to y, µm, all runs one after another.
+        What it adds to y, µm, all runs one after another; of a late T_Q that is left in what it would add.
     rivals : tuple of Rival
         What explains it nearly as well.
     replaced : bool
@@ -115,8 +116,15 @@ class FoundEffect:
     @property
     def explanation(self) -> str:
         """For an engineer."""
-        words = self.effect.explanation + LEFT_IN * self.left_in
+        words = self.effect.explanation
+        if self.left_in:
+            words = words.replace(CORRECTED, LEFT_IN)
         return words.replace(NEEDS_CHANNEL, "") + REPLACED if self.replaced else words
+
+    @property
+    def removed(self) -> Vector:
+        """What of its signal the named effects explain in the residual, µm: nothing where it is left in."""
+        return np.zeros(self.signal.size) if self.left_in else self.signal
 
     @property
     def deployable(self) -> bool:

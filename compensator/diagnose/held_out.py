@@ -73,6 +73,7 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
             unobserved=unobserved,
             grid=grid,
             foresight=found.foresight,
+            leaves_late=found.left_in is not None,
             of_time=not_deployed(found)[1],
             rests=(found.selection.fit.rest, found.selection.before.rest),
         ),
@@ -142,10 +143,11 @@ def _predictions(
     unobserved: bool,
     grid: Grid | None,
     foresight: Foresight | None,
+    leaves_late: bool,
     of_time: Vector,
     rests: tuple[Rest, Rest],
 ) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight)
+    found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
     steps, total = [], found.own_paths
     for place in places:
         total = sum(

@@ -121,7 +121,7 @@ class Diagnosis:
     held_out_before, held_out_named, held_out_after : numpy.ndarray, shape (n,)
         Before, with the named effects, and with the remainder, too, each block by a search that did not see it.
     steps : tuple of Step
-        The error on held-out data with the first effect, the first two, and so on.
+        The error on held-out data with the first effect, the first two, and so on (`stepped`).
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
     warnings : tuple of Remark
@@ -188,6 +188,11 @@ class Diagnosis:
     def counts_from_rest(self) -> bool:
         """Whether an effect counts from where T_Q is AT, because the data begin warm."""
         return any(effect.term.hypothesis.rest == EQUAL for effect in self.effects)
+
+    @property
+    def stepped(self) -> tuple[FoundEffect, ...]:
+        """The effects of `steps`: all but a late T_Q that is left in."""
+        return tuple(effect for effect in self.effects if not effect.left_in)
 
     def deploys(self, effect: FoundEffect) -> bool:
         """Return whether the extended model has an effect."""

@@ -12,9 +12,9 @@ def series_of(diagnosis: Diagnosis) -> dict[str, Vector]:
     """Return the curves by name, each of shape (n,), one row for each sample; NaN where Y is missing.
 
     `run` counts from 1, `t_s` is the time in it. `residual_…` are of the fit to all data, `held_out_…` of searches that
-    did not see the sample, `effect_1_um` is what the first effect adds to Y, `remainder_um` what the remainder adds to
-    all of them and `paths_um` what paths do that were fitted anew (where there are any). Then come the channels of
-    the effects.
+    did not see the sample, `effect_1_um` is what the first effect adds to Y (0 where it is left in), `remainder_um`
+    what the remainder adds to all of them and `paths_um` what paths do that were fitted anew (where there are any).
+    Then come the channels of the effects.
     """
     evidence = diagnosis.evidence
     sizes = [run.t_s.size for run in evidence.runs]
@@ -31,7 +31,7 @@ def series_of(diagnosis: Diagnosis) -> dict[str, Vector]:
         "at_degc": np.concatenate([run.at_degc for run in evidence.runs]),
     }
     for i, effect in enumerate(diagnosis.effects, start=1):
-        columns[f"effect_{i}_um"] = effect.signal
+        columns[f"effect_{i}_um"] = effect.removed
     beside = {"remainder_um": diagnosis.remainder_um, "paths_um": diagnosis.paths_um}
     columns |= {name: values for name, values in beside.items() if values.any()}
     for name in dict.fromkeys(channel for effect in diagnosis.effects for channel in effect.channels):

@@ -102,7 +102,7 @@ _UNITS = {
 }
 
 #: Keys of an effect in `diagnosis.json`, after its place.
-_FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_after_um")
+_FIGURES = ("parameters", "deployable", "left_in", "explanation", "rms_before_um", "rms_after_um")
 
 
 def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dict[str, Any]:
@@ -374,7 +374,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     """Return the errors on held-out data before and after, and what they are compared with."""
     rows = [["base model", *diagnosis.before.cells()]]
     if len(diagnosis.effects) > 1:
-        pairs = zip(diagnosis.effects, diagnosis.steps, strict=False)
+        pairs = zip(diagnosis.stepped, diagnosis.steps, strict=False)
         rows += [[f"+ {name(effect)}", f"{step.rms_um:.2f}", "", ""] for effect, step in pairs]
     if diagnosis.effects:
         rows.append(["with the effects", *(diagnosis.named if diagnosis.remainder else diagnosis.after).cells()])
@@ -404,7 +404,7 @@ def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Expl
     """Return the explanation of an effect, and whether the extended model has it."""
     if diagnosis.deploys(effect):
         deploy = "Deployed in the extended model."
-    elif effect.effect.deployable and not effect.deployable:
+    elif effect.replaced or effect.left_in:
         deploy = "Not in the extended model."
     elif effect.deployable:
         deploy = "Not deployed: the model was left unchanged."

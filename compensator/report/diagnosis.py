@@ -106,7 +106,7 @@ def page_of(
 
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     """Show the residual of the base model, the effects over it, and below it what the largest of them act by."""
-    total = np.sum([effect.signal for effect in diagnosis.effects], axis=0)
+    total = np.sum([effect.removed for effect in diagnosis.effects], axis=0)
     rest, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
     deployed = rest is not None and rest.deployed
     stands = deployed and rest is not None and rest.instead
@@ -204,7 +204,7 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
         y_label="Y, µm",
         lines=(
             time.line(
-                "residual without it", diagnosis.residual_after + diagnosis.remainder_um + effect.signal, weight=0.9
+                "residual without it", diagnosis.residual_after + diagnosis.remainder_um + effect.removed, weight=0.9
             ),
             time.line(
                 "effect" if diagnosis.deploys(effect) else "effect (not in the extended model)",

@@ -119,7 +119,7 @@ def error_of(outcomes, true_um):
 def whole(week):
     """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error.
 
-    A displacement sensor makes no error of the offset; a probed feature that has moved does, until a person has seen to it.
+    A displacement sensor makes no error of the offset; a probed feature that has moved does until somebody sees to it.
     """
     found = np.ones(week.minutes, dtype=bool)
     for trouble in week.troubles:

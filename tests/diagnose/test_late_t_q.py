@@ -18,6 +18,7 @@ from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
+from compensator.diagnose.series import series_of
 from compensator.identify.calibration import predict
 from compensator.model.effects.base import Effect, effect_from, filters
 from compensator.model.effects.delay import DelayedSensor
@@ -186,13 +187,19 @@ def test_a_correction_that_does_harm_is_left_out_and_what_stands_beside_it_is_de
     assert [gain.place, delay.place] == [("gain", "DTF", ""), PLACE]
     assert [effect.kind for effect in found.model.effects] == ["gain"]
     assert found.deploys(gain) and not found.deploys(delay)
-    assert "T_Q is used as it is" in delay.explanation and "T_Q is used as it is" not in gain.explanation
-    # Known with the future it explains all that is left, and what it leaves in is stated and looked for no further.
+    assert "T_Q is used as it is" in delay.explanation and "can correct this" not in delay.explanation
+    assert gain.named["change"] == pytest.approx(-0.2, abs=4.0 * gain.std["change"])
+    # Known with the future it explains all that is left: that is stated, and looked for no further.
     assert delay.rms_after_um < 0.3 * delay.rms_before_um
-    assert found.verdict == "partly_explained"
+    assert found.advice is None or found.advice.unexplained is None
     assert found.model.y_std_um == pytest.approx(gain.rms_after_um, rel=0.3)
     assert found.after.rms_um == pytest.approx(gain.rms_after_um, rel=0.1)
     assert removed(found, [late], [weaker]) > 0.85
+    # The page draws what the model takes off, and what is left with the delay in it.
+    curves = series_of(found)
+    assert np.nanstd(curves["residual_after_um"]) == pytest.approx(gain.rms_after_um, rel=0.05)
+    assert curves["effect_1_um"].any() and not curves["effect_2_um"].any()
+    assert len(found.steps) == 1
 
 
 def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:

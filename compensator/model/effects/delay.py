@@ -51,6 +51,10 @@ class DelayedPath(Effect):
         return " and ".join(f"{what} of {digits(value)} min" for what, value in times if value)
 
 
+#: What a late T_Q says of its correction; left out where it is not corrected.
+CORRECTED = " The model can correct this in real time, except for the first minutes after a change."
+
+
 @register
 class DelayedSensor(DelayedPath):
     """A late T_Q: the observer corrects it, so that every other effect gets corrected signals, too."""
@@ -94,9 +98,8 @@ class DelayedSensor(DelayedPath):
     def explain(self, seen: Seen) -> str:
         what = "the sensor T_Q is late" if self.form == "sensor" else "the heat reaches T_Q late,"
         return (
-            f"{seen.words} after changes of the heat: {what} by {self._times()}. The model can correct this in "
-            "real time, except for the first minutes after a change. Better: move the sensor closer to the source, or "
-            "mount it with better thermal contact."
+            f"{seen.words} after changes of the heat: {what} by {self._times()}.{CORRECTED} Better: move the sensor "
+            "closer to the source, or mount it with better thermal contact."
         )
 
 

@@ -31,8 +31,8 @@ BEFORE_H = 1.0
 def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
     """Return outcomes as the table of a diagnosis; the time counts from 1970.
 
-    Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own, whose time is
-    the end of the polls in whose middle it was.
+    Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own: as much later
+    than the probe as the time of a sample, its end, is than the middle of its polls.
     """
     return table_of_rows(
         [(outcome.sample, outcome.offset) for outcome in record],
@@ -73,7 +73,8 @@ def table_of_rows(
         y = np.where(np.isin(t_s, left_out), np.nan, y)
     columns["y_um"] = y
     if not np.isfinite(y).any():
-        behind_ns = rows[0][0].behind_ns if rows else 0
+        # A sample in which the service began has fewer polls.
+        behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
         t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
     return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
 
