@@ -71,7 +71,7 @@ class Spell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TouchProbe:
-    """A touch probe at the end of a minute, and its error: noise, a chip, the feature's own movement, µm."""
+    """A touch probe within a minute, and its error: noise, a chip, the feature's own movement, µm."""
 
     minute: int
     error_um: float
