@@ -191,12 +191,12 @@ def _check_possible(run: Run, column: str, values: Vector) -> None:
         )
 
 
-def _check_alive(run: Run, column: str, values: Vector) -> None:
-    """Refuse a sensor that is noisy and then constant for an hour or more."""
+def dead_part(values: Vector) -> slice | None:
+    """Return the longest stretch of a sensor that is noisy and then constant for an hour or more; None without one."""
     steps = np.diff(values)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], (steps == 0.0).astype(int), [0]))))
     if edges.size == 0:
-        return
+        return None
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts))
     first, last = int(starts[longest]), int(ends[longest])
@@ -204,12 +204,20 @@ def _check_alive(run: Run, column: str, values: Vector) -> None:
     others = others[np.isfinite(others)]
     # Computed data is constant at rest before its start.
     if first == 0 or last - first < DEAD_SAMPLES or others.size < DEAD_SAMPLES:
-        return
+        return None
     turns = float(np.mean(others[1:] * others[:-1] < 0.0))
-    if turns > LIVELY_TURNS and float(np.mean(others == 0.0)) < LIVELY_STILL:
+    is_noisy = turns > LIVELY_TURNS and float(np.mean(others == 0.0)) < LIVELY_STILL
+    return slice(first, last + 1) if is_noisy else None
+
+
+def _check_alive(run: Run, column: str, values: Vector) -> None:
+    """Refuse a dead sensor."""
+    dead = dead_part(values)
+    if dead is not None:
+        t_s = run.t_s[dead]
         raise DataError(
-            f"{run.name}: {column} = {values[first]:g} in every sample from t_s = {run.t_s[first]:g} to "
-            f"{run.t_s[last]:g}, and noisy otherwise: a dead sensor? leave its cells empty there"
+            f"{run.name}: {column} = {values[dead.start]:g} in every sample from t_s = {t_s[0]:g} to "
+            f"{t_s[-1]:g}, and noisy otherwise: a dead sensor? leave its cells empty there"
         )
 
 

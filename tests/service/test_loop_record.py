@@ -47,6 +47,19 @@ def test_probes_about_one_zero_are_diagnosed_those_of_which_there_are_most(zero_
     assert at.size == sum((probe.time_utc_ns / 1e9 > zero_s) == (zero_at < samples / 2) for probe in taken)
 
 
+def test_a_sensor_that_stood_still_is_left_out_of_the_record_and_what_moves_stays() -> None:
+    """A T_Q that was stuck before the service noticed it would have each diagnosis refused for a day and more."""
+    rng, rows = np.random.default_rng(3), []
+    for i, one in enumerate(machine(600)):
+        t_q = one.channels["t_q_degc"]
+        held = rows[300][0].channels["t_q_degc"].mean if 300 < i <= 420 else round(t_q.mean + rng.normal(0.0, 0.03), 3)
+        channels = one.channels | {"t_q_degc": replace(t_q, mean=held)}
+        rows.append((replace(one, channels=channels), None))
+    columns = table_of_rows(rows, [], "record").columns
+    assert np.flatnonzero(np.isnan(columns["t_q_degc"])).tolist() == list(range(300, 421))
+    assert np.isfinite(columns["at_degc"]).all()
+
+
 async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(tmp_path: Path) -> None:
     service = Looping(tmp_path, shown(None, "adequate"), before_night=20 * 60)
     zero = service.at_sample[120] = Asked(service, "zero", mode="warm")

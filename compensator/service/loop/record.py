@@ -2,7 +2,8 @@
 
 Y is left out where a sample shows a fault by itself (`trust`), and for an hour before T_Q and AT contradict each other,
 in which the fault was there already. Temperatures and other channels stay as they were measured: they drive the model
-throughout.
+throughout. Only where T_Q, AT or Y stood still for an hour, as no live sensor does, are they left out, or each
+diagnosis of that record would be refused.
 
 Where Y is probed, the values of one feature about one zero are used, those of which there are most: at a zero the
 feature counts anew, and against the values before it that is a step which the machine did not make.
@@ -19,11 +20,14 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
+from compensator.data.screening import dead_part
 from compensator.data.table import Table
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.service.loop.trust import is_contradicted, is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 
+#: Sensors that never stand still.
+_ALIVE = ("t_q_degc", "at_degc", "y_um")
 #: Y is left out for so long before T_Q and AT contradict each other, h.
 BEFORE_H = 1.0
 
@@ -72,11 +76,22 @@ def table_of_rows(
     if left_out.size:
         y = np.where(np.isin(t_s, left_out), np.nan, y)
     columns["y_um"] = y
+    for channel in _ALIVE:
+        columns[channel] = _alive(columns[channel])
+    y = columns["y_um"]
     if not np.isfinite(y).any():
         # A sample in which the service began has fewer polls.
         behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
         t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
     return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+
+
+def _alive(values: Vector) -> Vector:
+    """Return values without those of a sensor that stood still."""
+    while (dead := dead_part(values)) is not None:
+        values = values.copy()
+        values[dead] = np.nan
+    return values
 
 
 def _mean(sample: Sample, channel: str) -> float:
