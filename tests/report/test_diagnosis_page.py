@@ -163,6 +163,7 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
         responses=(),
         explains=True,
         foresight=None,
+        left_in=None,
         is_own_error_alone=False,
     )
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
