@@ -240,6 +240,7 @@ def _findings_of(
     if is_of_paths:
         selection = search.of_paths(selection.before) or selection
     fit, foresight = foreseeing(selection.fit, foresight)
+    corrected = fit
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
     deployed = as_deployed(fit)
@@ -271,22 +272,50 @@ def _findings_of(
         foresight=foresight,
     )
     # A late T_Q alone is judged with everything that is deployed (`deployment.py`).
-    late = late_term(fit)
-    has_others = any(term.effect.deployable and term is not late for term in fit.terms)
-    if late is None or not has_others or evidence.is_sparse or evidence.free_paths or leaves_late is False:
+    late = late_term(corrected)
+    has_others = any(term.effect.deployable and term is not late for term in corrected.terms)
+    if late is None or not has_others or evidence.is_sparse or evidence.free_paths:
         return found
-    left_in = _with_late_left_in(found, late)
-    return left_in if leaves_late or in_free_run(left_in)[1] <= in_free_run(found)[1] else found
+    leaves_late = not _helps(late, corrected, found) if leaves_late is None else leaves_late
+    return _with_late_left_in(late, corrected, found) if leaves_late else found
 
 
-def _with_late_left_in(found: Findings, late: Term) -> Findings:
-    """Return findings whose late T_Q is named and not corrected: the others are those of T_Q as it is."""
-    others = [term for term in found.fit.terms if term.effect.lateness is None]
-    fit = settled(fit_terms(found.fit.likelihood, [term.start for term in others]))
-    remainder: Regressed | None = None
-    if _has_own_error(fit):
-        fit = foretelling(fit)
-        remainder = own_error(fit)
+def _helps(late: Term, corrected: Fit, found: Findings) -> bool:
+    """Return whether the correction of a late T_Q removes more errors than it makes, of the named effects alone.
+
+    Parameters
+    ----------
+    late : Term
+        The late T_Q.
+    corrected : Fit
+        All effects, without an own error beside them.
+    found : Findings
+        With the correction.
+    """
+    alone = dataclasses.replace(found, remainder=None, belongs=False, explains=True)
+    terms, responses, _ = as_deployed(corrected)
+    own_um = in_free_run(dataclasses.replace(alone, terms=terms, responses=tuple(responses)))[1]
+    return own_um < in_free_run(_left_in(alone, late, _without(late, corrected)))[1]
+
+
+def _without(late: Term, corrected: Fit) -> Fit:
+    """Return the effects beside a late T_Q, fitted to T_Q as it is."""
+    others = [term.start for term in corrected.terms if term is not late]
+    return fit_terms(corrected.likelihood, others)
+
+
+def _with_late_left_in(late: Term, corrected: Fit, found: Findings) -> Findings:
+    """Return findings whose late T_Q is named and not corrected; parameters as `_helps` has them."""
+    fit = settled(_without(late, corrected))
+    if not _has_own_error(fit):
+        return _left_in(dataclasses.replace(found, remainder=None, belongs=False, explains=True), late, fit)
+    fit = foretelling(fit)
+    beside = dataclasses.replace(found, remainder=own_error(fit), belongs=True, explains=True)
+    return _left_in(beside, late, fit)
+
+
+def _left_in(found: Findings, late: Term, fit: Fit) -> Findings:
+    """Return findings with the effects of a fit, and a late T_Q that adds nothing."""
     evidence, beside = found.search.evidence, iter(fit.terms)
     terms = tuple(late if term.effect.lateness is not None else next(beside) for term in found.terms)
     nothing = np.zeros(evidence.used.size)
@@ -295,9 +324,6 @@ def _with_late_left_in(found: Findings, late: Term) -> Findings:
         fit=fit,
         terms=terms,
         responses=tuple(nothing if term is late else response(evidence, term) for term in terms),
-        remainder=remainder,
-        belongs=remainder is not None,
-        explains=True,
         left_in=late,
     )
 

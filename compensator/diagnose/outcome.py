@@ -23,8 +23,6 @@ Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
 #: Blocks that are held out, one after another.
 FOLDS = 3
-#: Held-out blocks that are left with this share of the error or more confirm nothing.
-NO_BETTER = 0.99
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,7 +257,7 @@ def warnings_of(
         warnings.append(Remark(ModelWarning.TOO_SHORT, text))
     # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
     elif any(effect.effect.observed for effect in effects) and (
-        rms_after > rms_before or (deployed and rms_after >= NO_BETTER * rms_before)
+        rms_after > rms_before or (deployed and rms_after == rms_before)
     ):
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
