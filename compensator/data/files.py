@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.data import mat_reader
@@ -215,7 +216,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
         if role in roles:
             raise DataError(f"{paths[0]}: --column {role}={roles[role]}: a recording has a time of its own")
     parts = [_read_recording(path) for path in paths]
-    tables = [table.with_roles(roles) for table, _, _ in parts]
+    tables = [table.with_roles(roles) for table, _ in parts]
     names = dict.fromkeys(name for table in tables for name in table.columns)
     t_s = np.concatenate([table.t_s for table in tables])
     columns = {
@@ -224,15 +225,13 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     }
     remarks: tuple[Remark, ...] = ()
     if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        probes, remarks = measured_probes(str(paths[0]), [some for _, some, _ in parts])
+        probes, remarks = measured_probes(str(paths[0]), [some for _, some in parts])
         if probes:
             blank = np.full(len(probes), np.nan)
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
             values = [number(probe.deformation_um) for probe in probes]
             columns["y_um"] = np.concatenate([np.full(t_s.size, np.nan), values])
-            behind_ns = {id(probe): behind for _, some, behind in parts for probe in some}
-            times = [(probe.time_utc_ns + behind_ns[id(probe)]) / 1e9 for probe in probes]
-            t_s = np.concatenate([t_s, times])
+            t_s = np.concatenate([t_s, [probe.time_utc_ns / 1e9 for probe in probes]])
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
@@ -283,8 +282,8 @@ def _showing_deformation(name: str, recordings: Sequence[Sequence[Probe]]) -> tu
     return shown, (Remark(DataRemark.PROBES_LEFT_OUT, words),)
 
 
-def _read_recording(path: Path) -> tuple[Table, list[Probe], int]:
-    """Return the samples of a recording, whose time counts from 1970, its probes, and `behind_ns` of its samples."""
+def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
+    """Return the samples of a recording, whose time counts from 1970, and its probes with the times of their rows."""
     times: list[int] = []
     behind_ns = 0
     samples: list[dict[str, float]] = []
@@ -304,4 +303,4 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe], int]:
     names = dict.fromkeys(name for row in samples for name in row)
     columns = {name: np.array([row.get(name, math.nan) for row in samples]) for name in names}
     table = Table(name=str(path), t_s=np.array(times) / 1e9, columns=columns, rows=range(2, len(times) + 2))
-    return table, probes, behind_ns
+    return table, [replace(probe, time_utc_ns=probe.time_utc_ns + behind_ns) for probe in probes]

@@ -24,7 +24,7 @@ from compensator.diagnose.deployment import deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, in_free_run
-from compensator.diagnose.fit import Term, fit_terms, response
+from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.found_effect import FoundEffect, described, no_further_than_seen, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
@@ -234,7 +234,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
         errors = with_time_errors(found.fit, errors)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
         is_left_in = term is found.left_in
-        signal = response(evidence, term) if is_left_in else found.responses[i]
+        signal = found.left_in_um if is_left_in else found.responses[i]
 
         def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
             return deciding.best(selection.fit, rival.fit, (label(first), label(rival.term)))
@@ -409,7 +409,7 @@ def _verdict(
         left = evidence.left(evidence.residual, added, at_rest=False)[evidence.used]
         return noise.is_explained(float(left @ left))
 
-    is_noise = leaves_noise(found.known)
+    is_noise = leaves_noise(found.whole + found.left_in_um)
     if not observed:
         if is_adequate(found, held_out):
             return "adequate", False
@@ -427,6 +427,7 @@ def _verdict(
         return rms_of(values) ** 2 < most_um2
 
     nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains and holds_in_free_run
-    named = found.named + (found.known - found.whole)
-    by_names = leaves_noise(named) and holds(held_out.named) and all(e.is_determined for e in effects)
+    by_names = (
+        leaves_noise(found.named + found.left_in_um) and holds(held_out.named) and all(e.is_determined for e in effects)
+    )
     return ("explained" if nothing_left and by_names else "partly_explained"), nothing_left

@@ -91,11 +91,11 @@ class Findings:
         return self.channels.added
 
     @property
-    def known(self) -> Vector:
-        """What has a name or is corrected, µm: effects and remainder, and a late T_Q that is left in."""
+    def left_in_um(self) -> Vector:
+        """What a late T_Q that is left in would add, µm; 0 without one."""
         if self.left_in is None:
-            return self.whole
-        return self.whole + response(self.search.evidence, self.left_in)
+            return np.zeros(self.ceiling.size)
+        return response(self.search.evidence, self.left_in)
 
     @property
     def leaves_noise(self) -> bool:
@@ -240,15 +240,17 @@ def _findings_of(
     if is_of_paths:
         selection = search.of_paths(selection.before) or selection
     fit, foresight = foreseeing(selection.fit, foresight)
-    corrected = fit
+    late = late_term(fit)
+    others = [term for term in fit.terms if term is not late]
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
-    deployed = as_deployed(fit)
+    likelihood, named = fit.likelihood, as_deployed(fit)
+    deployed = named
     remainder: Regressed | None
     belongs = False
     if is_of_paths:
         remainder, explains, belongs = own_error_alone(selection.before), not selection.fit.terms, True
-    elif late_term(fit):
+    elif late:
         remainder, explains = _beside_late(deployed[2]), True
     else:
         remainder, explains = _remainder(search, fit, background, refitted, channels)
@@ -272,46 +274,30 @@ def _findings_of(
         foresight=foresight,
     )
     # A late T_Q alone is judged with everything that is deployed (`deployment.py`).
-    late = late_term(corrected)
-    has_others = any(term.effect.deployable and term is not late for term in corrected.terms)
-    if late is None or not has_others or evidence.is_sparse or evidence.free_paths:
+    has_others = any(term.effect.deployable for term in others)
+    if late is None or not has_others or evidence.is_sparse or evidence.free_paths or leaves_late is False:
         return found
-    leaves_late = not _helps(late, corrected, found) if leaves_late is None else leaves_late
-    return _with_late_left_in(late, corrected, found) if leaves_late else found
+    as_it_is = fit_terms(likelihood, [term.start for term in others])
+    if leaves_late is None:
+        # By the named effects alone: an own error takes in a lag, and goes elsewhere on another day.
+        alone = _named_alone(found)
+        own_um = in_free_run(dataclasses.replace(alone, terms=named[0], responses=tuple(named[1])))[1]
+        leaves_late = in_free_run(_left_in(alone, late, as_it_is))[1] <= own_um
+    return _late_left_in(found, late, as_it_is) if leaves_late else found
 
 
-def _helps(late: Term, corrected: Fit, found: Findings) -> bool:
-    """Return whether the correction of a late T_Q removes more errors than it makes, of the named effects alone.
-
-    Parameters
-    ----------
-    late : Term
-        The late T_Q.
-    corrected : Fit
-        All effects, without an own error beside them.
-    found : Findings
-        With the correction.
-    """
-    alone = dataclasses.replace(found, remainder=None, belongs=False, explains=True)
-    terms, responses, _ = as_deployed(corrected)
-    own_um = in_free_run(dataclasses.replace(alone, terms=terms, responses=tuple(responses)))[1]
-    return own_um < in_free_run(_left_in(alone, late, _without(late, corrected)))[1]
-
-
-def _without(late: Term, corrected: Fit) -> Fit:
-    """Return the effects beside a late T_Q, fitted to T_Q as it is."""
-    others = [term.start for term in corrected.terms if term is not late]
-    return fit_terms(corrected.likelihood, others)
-
-
-def _with_late_left_in(late: Term, corrected: Fit, found: Findings) -> Findings:
-    """Return findings whose late T_Q is named and not corrected; parameters as `_helps` has them."""
-    fit = settled(_without(late, corrected))
+def _late_left_in(found: Findings, late: Term, others: Fit) -> Findings:
+    """Return findings whose late T_Q is named and not corrected, beside others that are fitted to T_Q as it is."""
+    fit = settled(others)
     if not _has_own_error(fit):
-        return _left_in(dataclasses.replace(found, remainder=None, belongs=False, explains=True), late, fit)
+        return _left_in(_named_alone(found), late, fit)
     fit = foretelling(fit)
-    beside = dataclasses.replace(found, remainder=own_error(fit), belongs=True, explains=True)
-    return _left_in(beside, late, fit)
+    return _left_in(dataclasses.replace(_named_alone(found), remainder=own_error(fit), belongs=True), late, fit)
+
+
+def _named_alone(found: Findings) -> Findings:
+    """Return findings without a remainder."""
+    return dataclasses.replace(found, remainder=None, belongs=False, explains=True)
 
 
 def _left_in(found: Findings, late: Term, fit: Fit) -> Findings:

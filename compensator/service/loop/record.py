@@ -78,8 +78,7 @@ def table_of_rows(
     columns["y_um"] = y
     for channel in _ALIVE:
         columns[channel] = _alive(columns[channel])
-    y = columns["y_um"]
-    if not np.isfinite(y).any():
+    if not np.isfinite(columns["y_um"]).any():
         # A sample in which the service began has fewer polls.
         behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
         t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
