@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from compensator.diagnose.standing import is_hidden
 from compensator.display import Words
 
 #: Named effects that explain less than this of what the channels explain fall short of it, %. It is what an engineer
@@ -125,7 +126,7 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     if fit := found.get("fit"):
         named = fit["named_um"] if found["effects"] else fit["before_um"]
         figures += f" In the fit to all data: {named:.2f} and {fit['after_um']:.2f}."
-    deployed = _why_deployed(rest, named=bool(found["effects"]))
+    deployed = _why_deployed(rest, named=bool(found["effects"]), hidden=is_hidden(found))
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
         figures,
@@ -140,7 +141,7 @@ def _part(rest: Mapping[str, Any]) -> str:
     return "" if share > 0.99 else f"{100.0 * share:.0f} % of "
 
 
-def _why_deployed(rest: Mapping[str, Any], *, named: bool) -> str:
+def _why_deployed(rest: Mapping[str, Any], *, named: bool, hidden: bool) -> str:
     """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
     deployed = "Deployed in the extended model"
     if rest.get("belongs"):
@@ -153,6 +154,8 @@ def _why_deployed(rest: Mapping[str, Any], *, named: bool) -> str:
             f"{deployed}{place}: it is {_part(rest)}the base model's own error{beside}, as much of it as predicts "
             "held-out data best."
         )
+    if rest.get("instead") and hidden:
+        return f"{deployed} in place of the source, which nothing foretells."
     if rest.get("instead"):
         why = "which leave more on held-out data" if lowers(rest) else "because all data are more probable with it"
         return f"{deployed} in place of the named effects, {why}."

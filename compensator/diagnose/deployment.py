@@ -32,7 +32,11 @@ LOWERS_CLEARLY = 0.75
 #: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
 #: any slow channel.
 LOWERS_BY_FAR = 0.6
-#: From a record shorter than this, h, a model with an error of its own is extended only by names that leave noise.
+#: In the place of a source that no channel shows they leave less than this share of the error in free run: where it
+#: acts once in each block, held-out blocks refute everything.
+SHOWS_HIDDEN = 0.4
+#: From a record shorter than this, h, a model with an error of its own is extended only by names that leave noise, or
+#: that held-out blocks confirm with no parameter smaller than its error.
 SHORT_H = 8.0
 
 
@@ -106,7 +110,7 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
         held_out=held_out,
         contradicted=_is_contradicted(found, held_out),
         worse_um=_worse_in_free_run(found),
-        too_short_h=_too_short_h(found, effects),
+        too_short_h=_too_short_h(found, effects, held_out),
     )
     return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
 
@@ -179,29 +183,42 @@ def _by_channels(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Deploy all channels in the place of useless names, or of none, where held-out data clearly confirm them."""
-    instead, (whole_um, nothing_um) = by_channels(found), map(rms_of, (held_out.whole, held_out.nothing))
-    lowers = LOWERS_CLEARLY if found.terms else LOWERS_BY_FAR
-    # What is not known, in a record without a block to hold out, confirms nothing.
-    if instead is None or not rms_of(held_out.ceiling) <= min(whole_um, lowers * nothing_um):
+    instead = by_channels(found)
+    if instead is None or not _is_confirmed(instead, held_out):
         return found, effects, held_out
     effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
 
 
-def _too_short_h(found: Findings, effects: Sequence[FoundEffect]) -> float | None:
+def _is_confirmed(instead: Findings, held_out: HeldOut) -> bool:
+    """Return whether all channels, in the place of names or of none, are confirmed clearly."""
+    if instead.terms and not any(term.effect.observed for term in instead.terms):
+        base_um, own_um = in_free_run(instead)
+        return own_um < SHOWS_HIDDEN * base_um
+    whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
+    lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
+    # What is not known, in a record without a block to hold out, confirms nothing.
+    return rms_of(held_out.ceiling) <= min(whole_um, lowers * nothing_um)
+
+
+def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut) -> float | None:
     """Return the length of a record, h, that is too short for what would be deployed; None if it is not.
 
     In the few hours of one warm-up the own error of an approximate model looks like a missing effect, on held-out
-    blocks, too, and paths are not known from it. Names that leave noise are those of what acts.
+    blocks, too, and paths are not known from it. Names that leave noise are those of what acts; what held-out blocks
+    confirm, with no parameter smaller than its error, is near enough to it.
     """
     evidence = found.search.evidence
     hours = sum(float(np.ptp(run.t_s)) for run in evidence.runs) / 3600.0
     deploys = found.remainder is not None or any(effect.deployable for effect in effects)
     if hours >= SHORT_H or not deploys or evidence.is_sparse or not evidence.context.approximate:
         return None
+    if not (found.terms and found.explains) or evidence.free_paths:
+        return hours
     left = evidence.left(evidence.residual, found.named, at_rest=False)[evidence.used]
-    is_explained = found.terms and not evidence.free_paths and evidence.noise.is_explained(float(left @ left))
-    return None if is_explained else hours
+    is_confirmed = rms_of(held_out.whole) < rms_of(held_out.nothing)
+    is_known = is_confirmed and not any(effect.loose for effect in effects)
+    return None if is_known or evidence.noise.is_explained(float(left @ left)) else hours
 
 
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:

@@ -330,7 +330,7 @@ def _with_deviation(
     kept_out = [
         effect.signal[evidence.used]
         for effect in of_machine
-        if effect.left_in or not (deploys and effect.effect.deployable)
+        if effect.left_in or not (deploys and (effect.effect.deployable or effect.replaced))
     ]
     left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
     is_approximate = found.refitted is not None or not found.search.points.is_exact

@@ -194,16 +194,19 @@ def _is_surpassed(found: Findings) -> bool:
 
 
 def by_channels(found: Findings) -> Findings | None:
-    """Return findings with all channels in the place of names that are worse than nothing in free run, or of none.
+    """Return findings with all channels in the place of names that gain nothing in free run, or of none.
 
-    Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect. And
-    what has no name may be as small as the model's own error, and come again all the same. None where the names are not
-    worse, or where all channels are.
+    Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect, and a
+    source that no channel shows may warm a part with a sensor. And what has no name may be as small as the model's own
+    error, and come again all the same. None where the names gain something, or where all channels are worse.
     """
     evidence = found.search.evidence
-    if evidence.is_sparse or (_is_no_worse(found) if found.terms else found.remainder is not None):
-        return None
-    if found.terms and not _is_worth_deploying(found.channels, _log_evidence(found.selection.before), evidence):
+    if any(term.effect.observed for term in found.terms):
+        known = _log_evidence(found.selection.before)
+        stays = _is_no_worse(found) or not _is_worth_deploying(found.channels, known, evidence)
+    else:
+        stays = not found.terms and found.remainder is not None
+    if evidence.is_sparse or stays:
         return None
     explains = not found.terms
     instead = dataclasses.replace(

@@ -25,6 +25,8 @@ from compensator.model.effects.seen import Range, Seen
 
 #: Said of an effect in whose place the remainder is deployed.
 REPLACED = " A regularised response does better than the names, so the remainder is deployed in its place."
+#: The same of a source that no channel shows.
+MADE_UP_FOR = " All channels together make up for it: the remainder is deployed in its place, and explains nothing."
 #: Said of a late T_Q that is left in.
 LEFT_IN = " A correction in real time would make more errors on this record than it removes, so T_Q is used as it is."
 #: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
@@ -119,7 +121,11 @@ class FoundEffect:
         words = self.effect.explanation
         if self.left_in:
             words = words.replace(CORRECTED, LEFT_IN)
-        return words.replace(NEEDS_CHANNEL, "") + REPLACED if self.replaced else words
+        return (
+            words.replace(NEEDS_CHANNEL, "") + (REPLACED if self.effect.observed else MADE_UP_FOR)
+            if self.replaced
+            else words
+        )
 
     @property
     def removed(self) -> Vector:
@@ -143,6 +149,11 @@ class FoundEffect:
         searched = {free.name for free in self.term.hypothesis.free}
         sized = [name for name in self.named if name not in searched] or list(self.named)
         return not sized or any(abs(self.named[name]) >= self.std[name] for name in sized)
+
+    @property
+    def loose(self) -> list[str]:
+        """Its parameters that are smaller than their standard errors."""
+        return [name for name, std in self.std.items() if std > abs(self.named[name]) > 0.0]
 
     @property
     def reverses_path(self) -> bool:

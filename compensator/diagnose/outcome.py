@@ -255,20 +255,19 @@ def warnings_of(
             "of the model looks like an effect, so it was left unchanged."
         )
         warnings.append(Remark(ModelWarning.TOO_SHORT, text))
-    # A source that no channel shows predicts nothing and is never deployed: a longer record changes nothing of that.
-    elif any(effect.effect.observed for effect in effects) and (
+    # A source that no channel shows predicts nothing and is never deployed: what is, or could be, must.
+    elif (deployed or any(effect.effect.observed for effect in effects)) and (
         rms_after > rms_before or (deployed and rms_after == rms_before)
     ):
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
-            text = f"The effects are clear in all data together, but do not predict held-out blocks better {numbers}."
+            text = f"What was found is clear in all data together, but predicts held-out blocks no better {numbers}."
             warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
         else:
             text = f"The effects increase the error on held-out blocks {numbers}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.MADE_WORSE, text))
     for effect in effects:
-        kind, named = effect.place[0], effect.named
-        loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
+        kind, named, loose = effect.place[0], effect.named, effect.loose
         if start_k and effect.term.effect.counts_from_rest and effect.place[1] == "DTF":
             text = (
                 f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from its start, as if "

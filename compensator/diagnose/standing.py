@@ -11,6 +11,7 @@ from typing import Any
 
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
 from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.model.effects.unobserved import Unobserved
 
 #: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
 #: mean square about the mean there: more is gone than stays.
@@ -69,6 +70,11 @@ def is_in_the_model(found: Mapping[str, Any]) -> bool:
     return any(effect.get("deployable", True) for effect in found["effects"])
 
 
+def is_hidden(found: Mapping[str, Any]) -> bool:
+    """Whether all that is named is a source that no channel shows."""
+    return bool(found["effects"]) and all(effect["kind"] == Unobserved.kind for effect in found["effects"])
+
+
 def words(found: Mapping[str, Any]) -> str:
     """Return what is said of the named effects beyond the verdict in one word; empty where that says all.
 
@@ -112,6 +118,11 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
     if not rest or not rest["deployed"] or not fit or found["verdict"] == "explained":
         return ""
     left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
+    if rest.get("instead") and is_hidden(found):
+        return (
+            f"Something acts that no channel shows by itself. All channels together make up for it: the remainder, "
+            f"which explains nothing, leaves {fit['after_um']:.2f} of {fit['before_um']:.2f} µm rms in the fit."
+        )
     if rest.get("instead"):
         return (
             f"What is named resembles the cause most: {left}. A regularised response does better: the remainder, which "

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
+import compensator as tc
 from compensator.diagnose.held_out import HeldOut
 from sim_hardware.physics import Duty
 from sim_hardware.physics.published import DEFORMATION_POLES, DTF, TDTF, TTF, TTF_POLES, tustin
@@ -159,3 +160,9 @@ def record(scenarios, seed, hours=36.0, *, noise_k=0.02, noise_um=0.3):
 def held_out_errors(nothing: np.ndarray, *, named: np.ndarray, whole: np.ndarray, ceiling: np.ndarray) -> HeldOut:
     """Errors on held-out blocks that are made up: the base is as it was."""
     return HeldOut(base=nothing, nothing=nothing, named=named, whole=whole, ceiling=ceiling, steps=())
+
+
+def errors_on_another_day(machine, *models):
+    """Return what models leave of a drawn machine's fresh run, µm, about its mean."""
+    day = machine.fresh
+    return [np.std(day.true_um - tc.simulate(model, day.columns)["y_pred_um"]) for model in models]

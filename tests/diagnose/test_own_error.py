@@ -19,7 +19,7 @@ from compensator.diagnose.search import Search
 from compensator.diagnose.summary import figures
 from compensator.model.model_file import load_model
 from sim_hardware.drawn_machines.cases import _cases
-from tests.diagnose.scenarios import draw, held_out_errors, record
+from tests.diagnose.scenarios import draw, errors_on_another_day, held_out_errors, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -142,11 +142,6 @@ def learned(changed):
         return tc.diagnose(base, machine.record.columns), searches[0]
 
 
-def errors_on_another_day(machine, *models):
-    day = machine.fresh
-    return [np.std(day.true_um - tc.simulate(model, day.columns)["y_pred_um"]) for model in models]
-
-
 def test_a_learned_error_of_the_paths_keeps_no_change_of_them_from_its_name(changed, learned):
     (machine, base), (why, _) = changed, learned
     assert [(effect.kind, effect.path) for effect in why.effects] == [("dynamics", "DTF")]
@@ -205,6 +200,16 @@ def test_what_all_channels_show_clearly_is_deployed_where_nothing_has_a_name():
     before_um, after_um = errors_on_another_day(machine, base, found.model)
     held_out = found.diagnosis
     assert after_um < before_um and held_out.after.rms_um < 0.6 * held_out.before.rms_um
+
+
+def test_a_few_hours_that_show_an_effect_surely_extend_an_approximate_model():
+    """Heat of a bearing in one shift: names leave more than noise, but no parameter is smaller than its error."""
+    machine = next(c for c in _cases(460_000) if (c.family, c.seed) == ("conduction", 460_018)).draw()
+    base = tc.identify(machine.calibration.columns, order=(4, 4, 4)).model
+    why = tc.diagnose(base, machine.record.columns)
+    assert why.verdict == "partly_explained" and [effect.place[2] for effect in why.effects] == ["spindle_rpm"]
+    before_um, after_um = errors_on_another_day(machine, base, why.model)
+    assert after_um < 0.1 * before_um
 
 
 @pytest.mark.parametrize(("hours", "base", "is_extended"), [(6, BASE, False), (6, QUILL, True)])
