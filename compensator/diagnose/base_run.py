@@ -145,6 +145,7 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Con
         sizes_um=sizes,
         taus_min={name: tuple(t for t in path.time_constants_min() if t > 0.0) for name, path in paths.items()},
         spans=spans,
+        first={name: float(signals[0].channels[name][0]) for name in spans},
         temperatures=tuple(name for name in usable if name.endswith(DEGC)),
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,

@@ -369,6 +369,7 @@ def test_the_search_never_proposes_it() -> None:
         sizes_um={"DTF": 50.0, "TDTF": 5.0},
         taus_min={"DTF": (20.0,)},
         spans={"coolant_degc": 3.0},
+        first={"coolant_degc": 20.0},
         functions={"DTF": ((0.1,), (1.0,)), "TDTF": ((0.1,), (1.0,))},
         approximate=True,
     )

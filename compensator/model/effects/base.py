@@ -57,6 +57,17 @@ def text(*choices: str) -> Any:
     return dataclasses.field(metadata=_text(choices))
 
 
+def text_or_number(*choices: str) -> Any:
+    """Return a constant that the model file holds: one of the choices, or a number; no parameter of the effect."""
+
+    def read(table: TomlTable, key: str) -> str | float:
+        value = table.table.get(key)
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        return table.number(key) if is_number else table.text(key, choices)
+
+    return dataclasses.field(metadata={"read": read, "constant": True})
+
+
 def texts() -> Any:
     """Return a parameter that the model file holds: a list of strings."""
     return dataclasses.field(metadata={"read": lambda table, key: table.texts(key)})
@@ -206,7 +217,7 @@ class Effect:
     @property
     def parameters(self) -> tuple[float, ...]:
         """Every numeric parameter, in the order of the model file."""
-        return tuple(number for f in _read(type(self)) for number in _numbers(getattr(self, f.name)))
+        return tuple(number for f in _varied(type(self)) for number in _numbers(getattr(self, f.name)))
 
     def moved(self, row: Sequence[float]) -> Effect:
         """Return the effect with a row of `std_factor` added to its parameters.
@@ -220,7 +231,7 @@ class Effect:
         if len(row) != count:
             raise ValueError(f"{len(row)} numbers, expected {count}, one for each parameter")
         steps, values = iter(row), dict[str, Any]()
-        for f in _read(type(self)):
+        for f in _varied(type(self)):
             value = getattr(self, f.name)
             numbers = tuple(number + next(steps) for number in _numbers(value))
             if numbers:
@@ -375,6 +386,10 @@ def _check_moved(effect: Effect) -> None:
 
 def _read(form: type[Effect]) -> list[dataclasses.Field[Any]]:
     return [f for f in dataclasses.fields(form) if "read" in f.metadata]
+
+
+def _varied(form: type[Effect]) -> list[dataclasses.Field[Any]]:
+    return [f for f in _read(form) if "constant" not in f.metadata]
 
 
 def _choices(form: type[Effect]) -> tuple[str, ...]:

@@ -157,6 +157,8 @@ class Context:
         Time constants of each path, min.
     spans : mapping of str to float
         Span of each channel that moves, in its unit.
+    first : mapping of str to float
+        The first value of each of them.
     temperatures : tuple of str
         Channels in °C, whether they move or not: a tank of coolant stays as it is.
     zeroed : frozenset of str
@@ -182,6 +184,7 @@ class Context:
     sizes_um: Mapping[str, float]
     taus_min: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     spans: Mapping[str, float] = field(default_factory=dict)
+    first: Mapping[str, float] = field(default_factory=dict)
     temperatures: tuple[str, ...] = ()
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)

@@ -7,7 +7,8 @@ row      y += Σ_i L(τ_i) · (gain_i · c · drive + gain_share_i · c · y_pat
 film     y += Σ_i L(τ_i) · (gain_i · X(|c|, drive) + gain_share_i · X(|c|, y_path))
 
 with X what a film exchanges whose surface follows (`Exchange`), and c the channel in units of its own span: as it is
-where it has a zero of its own (a speed, a flow), as its change from the start where it has none (a temperature).
+where it has a zero of its own (a speed, a flow); as its change from the first value of the record that showed it where
+it has none (a temperature, a pump that always runs).
 """
 
 from __future__ import annotations
@@ -21,7 +22,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from compensator.arrays import NAN
-from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
+from compensator.model.effects.base import (
+    BankEffect,
+    Effect,
+    Run,
+    number,
+    numbers,
+    only,
+    register,
+    text,
+    text_or_number,
+)
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import MOVES, Seen, digits, quantity, unit_in, with_unit
@@ -40,11 +51,12 @@ class Scheduled(Effect):
     what: ClassVar[str] = "gain"
     path: str = text("DTF", "TDTF")
     channel: str = text()
-    origin: str = text("start", "zero")
+    origin: str | float = text_or_number("start", "zero")
     span: float = number(1e-12)
 
     def blocks(self, period_min: float) -> tuple[Block, ...]:
-        return FromStart(0.0 if self.origin == "zero" else NAN), *self.inner(period_min)
+        known = {"start": NAN, "zero": 0.0}
+        return FromStart(known[self.origin] if isinstance(self.origin, str) else self.origin), *self.inner(period_min)
 
     def inner(self, period_min: float) -> tuple[Block, ...]:
         return ()
@@ -175,7 +187,7 @@ def schedules(context: Context) -> Iterator[Hypothesis]:
     ones = (1.0,) * len(taus)
     gains = (*numbered("gain", len(taus)), *numbered("gain_share", len(taus)))
     for channel, path in itertools.product(context.channels, context.paths):
-        origin, (b, a) = "zero" if channel in context.zeroed else "start", context.functions[path]
+        origin, (b, a) = "zero" if channel in context.zeroed else context.first[channel], context.functions[path]
         place: dict[str, Any] = {"path": path, "channel": channel, "origin": origin, "span": context.spans[channel]}
         sizes = (context.change(path),)
         if context.approximate:
