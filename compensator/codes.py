@@ -479,6 +479,11 @@ class ModelWarning(Code):
         "The record is too short to extend the model by something that explains it only in part.",
         "Record for 8 h or more: a day, with heating and cooling.",
     )
+    BEGAN_WITHIN = (
+        "began_within",
+        "An effect began within the data, so it was looked for in measured Y since then.",
+        "Find out what was changed on the machine at that time.",
+    )
     NOT_CONFIRMED = (
         "not_confirmed",
         "The effects are clear in all data together, but a search without a block of time does not predict it.",

@@ -279,6 +279,7 @@ def diagnose(
     fit_until_h: float | None = None,
     validate: DataLike = (),
     keep_paths: bool = False,
+    whole: bool = False,
     progress: Progress = unreported,
     executor: Executor | None = None,
 ) -> DiagnosisResult | DiagnosedAxes:
@@ -306,6 +307,9 @@ def diagnose(
     keep_paths : bool
         Keep the paths of the base model as they are. By default they are fitted anew together with the effects where
         the model misses much of its own calibration.
+    whole : bool
+        Search all of the data, also where an effect began within them. By default it is then looked for in the time
+        since, if that explains itself clearly better.
     progress : callable
         Called with the steps done and their number.
     executor : concurrent.futures.Executor, optional
@@ -322,34 +326,35 @@ def diagnose(
         If model or data cannot be read, or there is too little data.
     """
     bases = models_of(model, axis)
-    whole = measurements(data, "data", columns, needed=True)
+    given = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)
-    check_each_once(whole)
-    check_validation(whole, validation)
-    longest = max(one.hours for one in whole)
+    check_each_once(given)
+    check_validation(given, validation)
+    longest = max(one.hours for one in given)
     if fit_until_h is not None and fit_until_h >= longest:
         raise UsageError(f"fit until {fit_until_h:g} h: the data end after {longest:.3g} h, expected an earlier hour")
     if axis is not None or len(bases) == 1:
-        axes = axes_in(whole, list(bases))
+        axes = axes_in(given, list(bases))
     else:
-        axes = tuple(one for one in bases if one in axes_in(whole, None)) or tuple(bases)[:1]
+        axes = tuple(one for one in bases if one in axes_in(given, None)) or tuple(bases)[:1]
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:
         assert executor is not None
         return executor.map(partial(in_one_thread, function), *values)
 
     def diagnosed(one: str, number: int, of: int, expected: frozenset[Place] = frozenset()) -> DiagnosisResult:
-        words = words_of(one, whole, validation, models=[bases[one].name])
+        words = words_of(one, given, validation, models=[bases[one].name])
         with words.errors():
             return _diagnosed(
                 bases[one],
-                of_axis(whole, one),
+                of_axis(given, one),
                 of_axis(validation, one),
                 words,
                 fit_until_h=fit_until_h,
                 y_std_um=y_std_um,
                 expected=expected,
                 keep_paths=keep_paths,
+                whole=whole,
                 progress=lambda done, steps: progress(number * steps + done, of * steps),
                 executor_map=executor_map if executor else map,
             )
@@ -361,8 +366,8 @@ def diagnose(
     results |= {one: diagnosed(one, i, len(missing), places) for i, (one, places) in enumerate(missing.items())}
     models = axes_as_in_file({one: result.model for one, result in results.items()})
     results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
-    names = [one for one in axes if all(column_of(one) in each.table.columns for each in whole)]
-    records = [record for each in whole for record in each.at_period(bases[axes[0]].period_s).records]
+    names = [one for one in axes if all(column_of(one) in each.table.columns for each in given)]
+    records = [record for each in given for record in each.at_period(bases[axes[0]].period_s).records]
     values = {one: [record.columns[column_of(one)] for record in records] for one in names}
     partners = {a: b for pair in pairs(values, bases[axes[0]].period_s) for a, b in pair.both_ways}
     found = across({one: result.diagnosis for one, result in results.items()}, partners)
@@ -371,7 +376,7 @@ def diagnose(
 
 def _diagnosed(
     base: ThermalModel,
-    whole: Sequence[Measurement],
+    given: Sequence[Measurement],
     validation: Sequence[Measurement],
     words: AxisWords,
     *,
@@ -379,11 +384,12 @@ def _diagnosed(
     y_std_um: float | None,
     expected: frozenset[Place],
     keep_paths: bool,
+    whole: bool,
     progress: Progress,
     executor_map: ExecutorMap,
 ) -> DiagnosisResult:
     """Diagnose the model of an axis on its data."""
-    measured = list(whole) if fit_until_h is None else [one.before(fit_until_h) for one in whole]
+    measured = list(given) if fit_until_h is None else [one.before(fit_until_h) for one in given]
     screened = partial(
         screened_runs_in, period_s=base.period_s, y_std_um=y_std_um, check=partial(require_channels, base)
     )
@@ -397,6 +403,7 @@ def _diagnosed(
         expected=expected,
         keep_paths=keep_paths,
         unseen=_is_unseen(base, measured),
+        whole=whole,
         progress=progress,
         executor_map=executor_map,
     )
@@ -404,9 +411,9 @@ def _diagnosed(
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
-    free_run = [errors(models, measured, SEARCHED)]
+    free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]
     if fit_until_h is not None:
-        free_run += [errors(models, [one], HELD_OUT, from_h=fit_until_h) for one in whole]
+        free_run += [errors(models, [one], HELD_OUT, from_h=fit_until_h) for one in given]
     for one in validation:
         absent = [name for name in extended.channels if name not in one.table.columns]
         if absent:

@@ -16,12 +16,13 @@ from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
+from compensator.diagnose.began import WELL_EXPLAINED, left_part
+from compensator.diagnose.change import changed_at
 from compensator.diagnose.deployment import SHORT_H
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.loop.change import changed_at
 from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
@@ -29,8 +30,6 @@ from compensator.service.outcome import Outcome
 #: Effects by which measured Y moves to another level by itself.
 _OF_Y = ("drift", "step")
 
-#: A record is explained well if no more than this part of its error is left on held-out data.
-WELL_EXPLAINED = 0.25
 #: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing, or nothing that is deployed.
 SHORTEST_H, FEWEST_PROBES = SHORT_H, 12
 #: An end must leave less than this part of what a longer part does.
@@ -113,7 +112,7 @@ class _Part:
     @classmethod
     def of(cls, table: Table, base: ThermalModel, probe_std_um: float | None) -> _Part:
         found = _diagnosed(table, base, probe_std_um)
-        return cls(table, found, _left(found, base))
+        return cls(table, found, left_part(found.diagnosis))
 
     def ends_from_s(self) -> float:
         """Return from when on its end is diagnosed, too, s."""
@@ -137,18 +136,6 @@ class _Part:
         return np.asarray(self.table.t_s.min() + np.concatenate([run.t_s for run in runs]))
 
 
-def _left(found: DiagnosisResult, base: ThermalModel) -> float:
-    """Return which part of the error on held-out data a diagnosis leaves; infinite if nothing can be deployed."""
-    if found.diagnosis.shows_nothing:
-        return 0.0
-    before, after, floor = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um, found.diagnosis.noise_floor_um
-    if len(found.model.effects) == len(base.effects):
-        return math.inf
-    if not before > floor:
-        return 1.0
-    return math.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
-
-
 def _end_of(table: Table, from_s: float) -> Table | None:
     """Return the end of a table; None if it is too short, or is all of it."""
     kept = table.t_s >= min(from_s, table.t_s.max() - 3600.0 * SHORTEST_H)
@@ -165,7 +152,7 @@ def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> 
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None
     # Of other paths a person decides: the loop only adds effects to the calibrated ones.
-    found = diagnose(base, [measured], y_std_um=y_std_um, keep_paths=True)
+    found = diagnose(base, [measured], y_std_um=y_std_um, keep_paths=True, whole=True)
     assert isinstance(found, DiagnosisResult)  # a base is of one axis
     return found
 

@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         fit_until_h=given.fit_until,
         validate=given.validate,
         keep_paths=given.keep_paths,
+        whole=given.whole,
         also=given.page,
     )
 
@@ -51,6 +52,7 @@ def diagnose_files(
     fit_until_h: float | None = None,
     validate: Sequence[Path] = (),
     keep_paths: bool = False,
+    whole: bool = False,
     also: Path | None = None,
 ) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
@@ -68,6 +70,7 @@ def diagnose_files(
             fit_until_h=fit_until_h,
             validate=validate,
             keep_paths=keep_paths,
+            whole=whole,
             progress=progress,
             executor=executor,
         )

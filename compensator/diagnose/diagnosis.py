@@ -17,6 +17,7 @@ from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
+from compensator.diagnose.began import began_within, explains_better
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
@@ -36,6 +37,7 @@ from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
+from compensator.errors import DataError
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
@@ -53,6 +55,7 @@ def diagnose(
     expected: frozenset[Place] = frozenset(),
     keep_paths: bool = False,
     unseen: bool = False,
+    whole: bool = False,
     progress: Progress = unreported,
     executor_map: ExecutorMap = map,
 ) -> Diagnosis:
@@ -71,6 +74,8 @@ def diagnose(
     unseen : bool
         Whether the base was calibrated on other data: its error on these is then to be surpassed by paths that are
         fitted anew, or they are kept.
+    whole : bool
+        Whether all of the data count, also where an effect began within them (`began`).
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -81,6 +86,33 @@ def diagnose(
     DataError
         If there is too little data.
     """
+    diagnosed = partial(
+        _diagnosed, model, expected=expected, keep_paths=keep_paths, unseen=unseen, executor_map=executor_map
+    )
+    found = diagnosed(runs, progress=progress)
+    began = None if whole else began_within(found)
+    if began is None:
+        return found
+    try:
+        later = diagnosed(began.runs, progress=after(progress, 1 + FOLDS))
+    except DataError:  # too little data since then
+        return found
+    if not explains_better(later, found):
+        return found
+    return dataclasses.replace(later, since_h=began.since_h, warnings=(began.remark, *later.warnings))
+
+
+def _diagnosed(
+    model: ThermalModel,
+    runs: Sequence[Run],
+    *,
+    expected: frozenset[Place],
+    keep_paths: bool,
+    unseen: bool,
+    progress: Progress,
+    executor_map: ExecutorMap,
+) -> Diagnosis:
+    """Diagnose all of the data; see `diagnose`."""
     evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
     evidence = evidence_of_runs(runs)
     searches = 1 + len(list(evidence.blocks(FOLDS)))
@@ -98,8 +130,15 @@ def diagnose(
     chosen = deployment_of(found, effects, held_out)
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     if unseen and chosen.base_foretells_better:
-        progress = after(progress, searches)
-        return diagnose(model, runs, expected=expected, keep_paths=True, progress=progress, executor_map=executor_map)
+        return _diagnosed(
+            model,
+            runs,
+            expected=expected,
+            keep_paths=True,
+            unseen=False,
+            progress=after(progress, searches),
+            executor_map=executor_map,
+        )
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model

@@ -36,7 +36,9 @@ def free_run_sentence(found: Mapping[str, Any]) -> str:
     words = f"{BASE} {in_words(scores, BASE)}"
     if EXTENDED in scores:
         own = scores[EXTENDED]
-        worse = ", so it is worse there" if own["rms_um"] > scores[BASE]["rms_um"] else ""
+        # The zero of the data is older than an effect that began within them, so it says nothing of that one's level.
+        key = "rms_about_mean_um" if found.get("since_h") and worst["role"] == SEARCHED else "rms_um"
+        worse = ", so it is worse there" if own[key] > scores[BASE][key] else ""
         words += f"; {EXTENDED} {own['rms_um']:.2f} and {own['rms_about_mean_um']:.2f}{worse}"
     several = f" (the worst of {len(held_out)})" if len(held_out) > 1 else ""
     where = f"On {worst['name']}{several}, which took no part in the search: " if held_out else ""

@@ -134,6 +134,8 @@ class Diagnosis:
         What to measure and to test next; None where the model is adequate.
     could_hide : DetectionLimits, optional
         Where Y was measured now and then: how much could act without being seen.
+    since_h : float
+        From when on measured Y was searched, h after the start of the data: an effect began then (`began`).
     """
 
     verdict: Verdict
@@ -156,6 +158,7 @@ class Diagnosis:
     ceiling: Ceiling | None = None
     advice: Advice | None = None
     could_hide: DetectionLimits | None = None
+    since_h: float = 0.0
 
     @property
     def shows_nothing(self) -> bool:

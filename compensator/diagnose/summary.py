@@ -144,6 +144,7 @@ def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dic
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
         **_could_hide(diagnosis.could_hide),
+        **({"since_h": diagnosis.since_h} if diagnosis.since_h else {}),
         "free_run": runs,
     }
 

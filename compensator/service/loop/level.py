@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.diagnose.change import FEWEST, changed_at
 from compensator.messages import number
-from compensator.service.loop.change import FEWEST, changed_at
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN, BLOCK_NS

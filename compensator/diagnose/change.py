@@ -17,7 +17,7 @@ BLOCK_MIN, FEWEST = 30.0, 8
 CHANGED = 5.0
 
 
-def changed_at(t_s: Vector, residual_um: Vector, floor_um: float) -> float | None:
+def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: float = np.inf) -> float | None:
     """Return when a residual has changed, s; None if it has not.
 
     Parameters
@@ -26,6 +26,8 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float) -> float | Non
         Time, and residual, µm; NaN where it is unknown.
     floor_um : float
         A standard deviation that does not matter, µm.
+    quiet : float
+        The residual must have varied by less than this part of what it varies by since.
 
     Examples
     --------
@@ -44,6 +46,11 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float) -> float | Non
     def cost(part: Vector) -> float:
         return 0.5 * part.size * float(np.log(np.var(part) + floor_um**2))
 
-    gains = [cost(means) - cost(means[:split]) - cost(means[split:]) for split in splits]
+    gains = [
+        cost(means) - cost(means[:split]) - cost(means[split:])
+        if np.std(means[:split]) <= quiet * np.std(means[split:])
+        else 0.0
+        for split in splits
+    ]
     best = int(np.argmax(gains))
     return float(numbers[splits[best]]) * 60.0 * BLOCK_MIN if gains[best] >= CHANGED else None
