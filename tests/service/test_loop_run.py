@@ -83,8 +83,17 @@ def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
     assert decisions(steps)[-1][1:] == ("nothing", "avoided")
 
 
-def test_a_diagnosis_that_finds_nothing_brings_the_calibrated_model_into_shadow() -> None:
-    night = Night(shown(extended()), shown(None, "adequate"))
+@pytest.mark.parametrize(
+    "later",
+    [
+        shown(None, "adequate"),
+        # Channels that make up for a source explain nothing.
+        Diagnosed("unexplained", ("regression:coolant_degc",), extended(), "text"),
+    ],
+    ids=["nothing", "a remainder"],
+)
+def test_a_diagnosis_that_explains_nothing_brings_the_calibrated_model_into_shadow(later: Diagnosed) -> None:
+    night = Night(shown(extended()), later)
     loop = LoopRun(settings(), QUILL, night)
     ends = 32 * 60
     steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))

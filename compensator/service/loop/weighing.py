@@ -1,7 +1,7 @@
 """What follows from the result of a diagnosis: the candidate, its effects, and how it differs from the present model.
 
 A diagnosis starts from the calibrated model, never from an extension, so an effect that has ended is found as one that
-has begun. The candidate is that model with the effects that can be deployed, or, where nothing is found, that model
+has begun. The candidate is that model with the effects that can be deployed, or, where nothing is explained, that model
 itself.
 """
 
@@ -86,8 +86,9 @@ def weigh(
         Hashes of the models in shadow.
     """
     base = model_of(config, calibrated, source="calibrated model")
-    data = found.model if found.verdict in _EXPLAINING and found.effects else None
-    if not found.effects and found.verdict != FAILED and present.sha256 != base.sha256:
+    explains = found.verdict in _EXPLAINING and bool(found.effects)
+    data = found.model if explains else None
+    if not explains and found.verdict != FAILED and present.sha256 != base.sha256:
         data = calibrated
     plain = without_candidate(found)
     if data is None:
