@@ -486,7 +486,7 @@ class ModelWarning(Code):
     )
     NOT_CONFIRMED = (
         "not_confirmed",
-        "The effects are clear in all data together, but a search without a block of time does not predict it.",
+        "What was found is clear in all data together, but a search without a block of time does not predict it.",
         "Check the extended model on another day: something in the data happened only once.",
     )
     PATH_REVERSED = (

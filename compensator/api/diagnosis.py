@@ -279,7 +279,7 @@ def diagnose(
     fit_until_h: float | None = None,
     validate: DataLike = (),
     keep_paths: bool = False,
-    whole: bool = False,
+    all_data: bool = False,
     progress: Progress = unreported,
     executor: Executor | None = None,
 ) -> DiagnosisResult | DiagnosedAxes:
@@ -307,9 +307,9 @@ def diagnose(
     keep_paths : bool
         Keep the paths of the base model as they are. By default they are fitted anew together with the effects where
         the model misses much of its own calibration.
-    whole : bool
-        Search all of the data, also where an effect began within them. By default it is then looked for in the time
-        since, if that explains itself clearly better.
+    all_data : bool
+        Search all of the data, also where an effect began within them, as with `fit_until_h` and of several axes. By
+        default it is then looked for in the time since, if that explains itself clearly better.
     progress : callable
         Called with the steps done and their number.
     executor : concurrent.futures.Executor, optional
@@ -354,7 +354,7 @@ def diagnose(
                 y_std_um=y_std_um,
                 expected=expected,
                 keep_paths=keep_paths,
-                whole=whole,
+                all_data=all_data or fit_until_h is not None or len(axes) > 1,
                 progress=lambda done, steps: progress(number * steps + done, of * steps),
                 executor_map=executor_map if executor else map,
             )
@@ -384,7 +384,7 @@ def _diagnosed(
     y_std_um: float | None,
     expected: frozenset[Place],
     keep_paths: bool,
-    whole: bool,
+    all_data: bool,
     progress: Progress,
     executor_map: ExecutorMap,
 ) -> DiagnosisResult:
@@ -403,7 +403,7 @@ def _diagnosed(
         expected=expected,
         keep_paths=keep_paths,
         unseen=_is_unseen(base, measured),
-        whole=whole,
+        all_data=all_data,
         progress=progress,
         executor_map=executor_map,
     )
@@ -441,5 +441,6 @@ def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diag
             "data": [origin.provenance() for one in measured for origin in one.origins],
             "verdict": found.verdict,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},
+            **({"since_h": found.since_h} if found.since_h else {}),
         }
     }

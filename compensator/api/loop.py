@@ -16,9 +16,9 @@ from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
-from compensator.diagnose.began import WELL_EXPLAINED, left_part
 from compensator.diagnose.change import changed_at
 from compensator.diagnose.deployment import SHORT_H
+from compensator.diagnose.onset import WELL_EXPLAINED, left_part
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
@@ -152,7 +152,7 @@ def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> 
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None
     # Of other paths a person decides: the loop only adds effects to the calibrated ones.
-    found = diagnose(base, [measured], y_std_um=y_std_um, keep_paths=True, whole=True)
+    found = diagnose(base, [measured], y_std_um=y_std_um, keep_paths=True, all_data=True)
     assert isinstance(found, DiagnosisResult)  # a base is of one axis
     return found
 

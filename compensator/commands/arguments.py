@@ -225,7 +225,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     words = "keep the paths of the model even where it misses much of its own calibration, as the loop does"
     add("--keep-paths", action="store_true", help=words)
     words = "search all of the data, also where an effect began within them, and not the time since then"
-    add("--whole", action="store_true", help=words)
+    add("--all-data", action="store_true", help=words)
     _page(parser)
     _column(parser)
     _axis(parser, "all that model and data have")

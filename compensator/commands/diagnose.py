@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         fit_until_h=given.fit_until,
         validate=given.validate,
         keep_paths=given.keep_paths,
-        whole=given.whole,
+        all_data=given.all_data,
         also=given.page,
     )
 
@@ -52,7 +52,7 @@ def diagnose_files(
     fit_until_h: float | None = None,
     validate: Sequence[Path] = (),
     keep_paths: bool = False,
-    whole: bool = False,
+    all_data: bool = False,
     also: Path | None = None,
 ) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
@@ -70,7 +70,7 @@ def diagnose_files(
             fit_until_h=fit_until_h,
             validate=validate,
             keep_paths=keep_paths,
-            whole=whole,
+            all_data=all_data,
             progress=progress,
             executor=executor,
         )

@@ -22,6 +22,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
+#: Samples whose median is where a channel is as a record begins.
+BEGINS = 10
 #: A record begins warm if what the machine had at its start is more than this share of the span of the DTF's share.
 WARM_SHARE = 0.05
 
@@ -145,7 +147,7 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Con
         sizes_um=sizes,
         taus_min={name: tuple(t for t in path.time_constants_min() if t > 0.0) for name, path in paths.items()},
         spans=spans,
-        first={name: float(signals[0].channels[name][0]) for name in spans},
+        first={name: float(np.median(signals[0].channels[name][:BEGINS])) for name in spans},
         temperatures=tuple(name for name in usable if name.endswith(DEGC)),
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,

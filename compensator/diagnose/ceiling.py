@@ -155,7 +155,8 @@ def _why_deployed(rest: Mapping[str, Any], *, named: bool, hidden: bool) -> str:
             "held-out data best."
         )
     if rest.get("instead") and hidden:
-        return f"{deployed} in place of the source, which nothing foretells."
+        why = "because it leaves far less of these data in free run"
+        return f"{deployed} in place of the source, which nothing foretells, {why}."
     if rest.get("instead"):
         why = "which leave more on held-out data" if lowers(rest) else "because all data are more probable with it"
         return f"{deployed} in place of the named effects, {why}."

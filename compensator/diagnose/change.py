@@ -17,7 +17,7 @@ BLOCK_MIN, FEWEST = 30.0, 8
 CHANGED = 5.0
 
 
-def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: float = np.inf) -> float | None:
+def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: float | None = None) -> float | None:
     """Return when a residual has changed, s; None if it has not.
 
     Parameters
@@ -26,8 +26,8 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: floa
         Time, and residual, µm; NaN where it is unknown.
     floor_um : float
         A standard deviation that does not matter, µm.
-    quiet : float
-        The residual must have varied by less than this part of what it varies by since.
+    quiet : float, optional
+        The residual must have varied by no more than this part of what it varies by since.
 
     Examples
     --------
@@ -48,7 +48,7 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: floa
 
     gains = [
         cost(means) - cost(means[:split]) - cost(means[split:])
-        if np.std(means[:split]) <= quiet * np.std(means[split:])
+        if quiet is None or np.std(means[:split]) <= quiet * np.std(means[split:])
         else 0.0
         for split in splits
     ]

@@ -33,8 +33,9 @@ LOWERS_CLEARLY = 0.75
 #: any slow channel.
 LOWERS_BY_FAR = 0.6
 #: In the place of a source that no channel shows they leave less than this share of the error in free run: where it
-#: acts once in each block, held-out blocks refute everything.
-SHOWS_HIDDEN = 0.4
+#: acts once in each block, held-out blocks refute everything. In less than a day, h, whatever is slow happens once, and
+#: held-out blocks must confirm them, too.
+SHOWS_HIDDEN, DAY_H = 0.4, 23.0
 #: From a record shorter than this, h, a model with an error of its own is extended only by names that leave noise, or
 #: that held-out blocks confirm with no parameter smaller than its error.
 SHORT_H = 8.0
@@ -182,19 +183,21 @@ def _as_far_as_confirmed(
 def _by_channels(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
-    """Deploy all channels in the place of useless names, or of none, where held-out data clearly confirm them."""
+    """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
     instead = by_channels(found)
-    if instead is None or not _is_confirmed(instead, held_out):
+    if instead is None or not _is_confirmed(instead, found, held_out):
         return found, effects, held_out
     effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in effects)
     return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
 
 
-def _is_confirmed(instead: Findings, held_out: HeldOut) -> bool:
-    """Return whether all channels, in the place of names or of none, are confirmed clearly."""
-    if instead.terms and not any(term.effect.observed for term in instead.terms):
-        base_um, own_um = in_free_run(instead)
-        return own_um < SHOWS_HIDDEN * base_um
+def _is_confirmed(instead: Findings, found: Findings, held_out: HeldOut) -> bool:
+    """Return whether all channels, in the place of what was found, are confirmed clearly."""
+    if found.terms and not any(term.effect.observed for term in found.terms):
+        if in_free_run(instead)[1] >= SHOWS_HIDDEN * min(in_free_run(found)):
+            return False
+        if _hours(found) >= DAY_H:
+            return True
     whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
     lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
     # What is not known, in a record without a block to hold out, confirms nothing.
@@ -208,8 +211,7 @@ def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: Held
     blocks, too, and paths are not known from it. Names that leave noise are those of what acts; what held-out blocks
     confirm, with no parameter smaller than its error, is near enough to it.
     """
-    evidence = found.search.evidence
-    hours = sum(float(np.ptp(run.t_s)) for run in evidence.runs) / 3600.0
+    evidence, hours = found.search.evidence, _hours(found)
     deploys = found.remainder is not None or any(effect.deployable for effect in effects)
     if hours >= SHORT_H or not deploys or evidence.is_sparse or not evidence.context.approximate:
         return None
@@ -217,8 +219,15 @@ def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: Held
         return hours
     left = evidence.left(evidence.residual, found.named, at_rest=False)[evidence.used]
     is_confirmed = rms_of(held_out.whole) < rms_of(held_out.nothing)
-    is_known = is_confirmed and not any(effect.loose for effect in effects)
+    is_known = is_confirmed and not any(effect.hardly_determined for effect in effects)
     return None if is_known or evidence.noise.is_explained(float(left @ left)) else hours
+
+
+def _hours(found: Findings) -> float:
+    """Return the time from the first to the last measured Y of all runs, h."""
+    evidence = found.search.evidence
+    seen = [run.t_s[evidence.used[part]] for run, part in zip(evidence.runs, evidence.samples_of_runs(), strict=True)]
+    return sum(float(np.ptp(t_s)) for t_s in seen if t_s.size) / 3600.0
 
 
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:

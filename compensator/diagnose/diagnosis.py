@@ -17,7 +17,6 @@ from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
-from compensator.diagnose.began import began_within, explains_better
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
@@ -31,6 +30,7 @@ from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
@@ -55,7 +55,7 @@ def diagnose(
     expected: frozenset[Place] = frozenset(),
     keep_paths: bool = False,
     unseen: bool = False,
-    whole: bool = False,
+    all_data: bool = False,
     progress: Progress = unreported,
     executor_map: ExecutorMap = map,
 ) -> Diagnosis:
@@ -74,8 +74,8 @@ def diagnose(
     unseen : bool
         Whether the base was calibrated on other data: its error on these is then to be surpassed by paths that are
         fitted anew, or they are kept.
-    whole : bool
-        Whether all of the data count, also where an effect began within them (`began`).
+    all_data : bool
+        Whether all of the data are searched, also where an effect began within them (`onset`).
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -89,17 +89,24 @@ def diagnose(
     diagnosed = partial(
         _diagnosed, model, expected=expected, keep_paths=keep_paths, unseen=unseen, executor_map=executor_map
     )
-    found = diagnosed(runs, progress=progress)
-    began = None if whole else began_within(found)
-    if began is None:
+    steps = 0
+
+    def counted(done: int, total: int) -> None:
+        nonlocal steps
+        steps = total
+        progress(done, total)
+
+    found = diagnosed(runs, progress=counted)
+    onset = None if all_data else onset_in(found)
+    if onset is None:
         return found
     try:
-        later = diagnosed(began.runs, progress=after(progress, 1 + FOLDS))
+        later = diagnosed([onset.run], keep_paths=True, progress=after(progress, steps))
     except DataError:  # too little data since then
         return found
     if not explains_better(later, found):
         return found
-    return dataclasses.replace(later, since_h=began.since_h, warnings=(began.remark, *later.warnings))
+    return dataclasses.replace(later, since_h=onset.since_h, warnings=(onset.remark, *later.warnings))
 
 
 def _diagnosed(

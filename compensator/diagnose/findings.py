@@ -198,7 +198,8 @@ def by_channels(found: Findings) -> Findings | None:
 
     Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect, and a
     source that no channel shows may warm a part with a sensor. And what has no name may be as small as the model's own
-    error, and come again all the same. None where the names gain something, or where all channels are worse.
+    error, and come again all the same. None where a name that a channel shows gains something, where a remainder is for
+    what has no name, and where all channels are worse.
     """
     evidence = found.search.evidence
     if any(term.effect.observed for term in found.terms):

@@ -121,11 +121,9 @@ class FoundEffect:
         words = self.effect.explanation
         if self.left_in:
             words = words.replace(CORRECTED, LEFT_IN)
-        return (
-            words.replace(NEEDS_CHANNEL, "") + (REPLACED if self.effect.observed else MADE_UP_FOR)
-            if self.replaced
-            else words
-        )
+        if not self.replaced:
+            return words
+        return words.replace(NEEDS_CHANNEL, "") + (REPLACED if self.effect.observed else MADE_UP_FOR)
 
     @property
     def removed(self) -> Vector:
@@ -151,7 +149,7 @@ class FoundEffect:
         return not sized or any(abs(self.named[name]) >= self.std[name] for name in sized)
 
     @property
-    def loose(self) -> list[str]:
+    def hardly_determined(self) -> list[str]:
         """Its parameters that are smaller than their standard errors."""
         return [name for name, std in self.std.items() if std > abs(self.named[name]) > 0.0]
 

@@ -135,7 +135,7 @@ class Diagnosis:
     could_hide : DetectionLimits, optional
         Where Y was measured now and then: how much could act without being seen.
     since_h : float
-        From when on measured Y was searched, h after the start of the data: an effect began then (`began`).
+        From when on measured Y was searched, h after the start of the data: an effect began then (`onset`).
     """
 
     verdict: Verdict
@@ -270,7 +270,7 @@ def warnings_of(
             text = f"The effects increase the error on held-out blocks {numbers}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.MADE_WORSE, text))
     for effect in effects:
-        kind, named, loose = effect.place[0], effect.named, effect.loose
+        kind, named, loose = effect.place[0], effect.named, effect.hardly_determined
         if start_k and effect.term.effect.counts_from_rest and effect.place[1] == "DTF":
             text = (
                 f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from its start, as if "

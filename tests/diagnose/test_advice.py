@@ -315,7 +315,7 @@ def test_a_source_that_no_channel_shows_is_no_reason_to_record_for_longer():
             term=SimpleNamespace(effect=SimpleNamespace(counts_from_rest=False)),
             place=("unobserved", "", ""),
             named={},
-            loose=[],
+            hardly_determined=[],
             rivals=(),
             reverses_path=False,
         )

@@ -33,6 +33,10 @@ def evidence(day):
     return evidence_of(QUILL, day)
 
 
+#: The gain of the DTF by the flow of a pump that always runs.
+SCHEDULE = {"path": "DTF", "channel": "pump_lpm", "form": "share", "origin": 8.0, "span": 2.0, "change": 0.1}
+
+
 def forms(evidence):
     wanted = ("coolant_degc", "fan_rpm", "")
     context = dataclasses.replace(evidence.context, approximate=True)
@@ -114,11 +118,33 @@ def test_a_restart_in_between_changes_no_bit(day, evidence):
         ("gain", {"path": "DTF", "chnge": 0.1}, "chnge"),
         ("hysteresis", {"path": "DTF", "form": "play", "half_width_um": float("nan")}, "half_width_um"),
         ("delay", {"path": "DTF", "delay_min": "soon", "lag_min": 0.0}, "delay_min"),
+        ("scheduled", SCHEDULE | {"origin": "20"}, "origin"),
+        ("scheduled", SCHEDULE | {"origin": True}, "origin"),
+        ("scheduled", SCHEDULE | {"origin": float("nan")}, "origin"),
     ],
 )
 def test_a_wrong_table_names_kind_key_and_value(kind, table, words):
     with pytest.raises(ModelError, match=f"effect {kind}: .*{words}"):
         effect_from(kind, table)
+
+
+@pytest.mark.parametrize(("origin", "acts"), [(8.0, True), ("zero", True), ("start", False)])
+def test_a_schedule_counts_from_its_origin_on_a_day_that_begins_elsewhere(origin, acts):
+    effect = effect_from("scheduled", SCHEDULE | {"origin": origin})
+    model = parse_model(dump_model(dataclasses.replace(QUILL, effects=(effect,))).encode(), source="test")
+    assert model.effects[0].origin == origin
+    engine = Engine(model)
+    engine.set_reference(20.0, 20.0)
+    added = [engine.step(40.0, 20.0, {"pump_lpm": 1.0}).y_effects_um[0] for _ in range(60)]
+    assert (abs(added[-1]) > 1.0) is acts
+
+
+def test_a_schedule_is_proposed_from_where_the_record_begins(evidence):
+    begins = np.median(evidence.runs[0].channels["coolant_degc"][:10])
+    found = [h.effect for h in forms(evidence) if h.effect.kind == "scheduled" and h.effect.channel == "coolant_degc"]
+    assert found and all(effect.origin == begins for effect in found)
+    # It is no parameter, so rows of `std_factor` of a file that counts from the start still fit.
+    assert all(effect.parameters == dataclasses.replace(effect, origin="start").parameters for effect in found)
 
 
 def test_a_channel_that_is_missing_at_first_starts_the_effect_when_it_comes():

@@ -478,6 +478,7 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         evidence = SimpleNamespace(model=model)
         residual_before = residual_after = np.full(3, 2.0)
         named_rms_um = 2.0
+        since_h = 0.0
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None

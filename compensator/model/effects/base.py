@@ -318,7 +318,7 @@ _loaded = False
 @dataclass_transform(
     frozen_default=True,
     kw_only_default=True,
-    field_specifiers=(number, optional_number, numbers, rows, optional_rows, text, texts, only),
+    field_specifiers=(number, optional_number, numbers, rows, optional_rows, text, text_or_number, texts, only),
 )
 def register(form: type[_E]) -> type[_E]:
     """Make a form of a kind of effect a frozen dataclass, and register it (class decorator)."""

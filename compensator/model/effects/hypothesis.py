@@ -158,7 +158,7 @@ class Context:
     spans : mapping of str to float
         Span of each channel that moves, in its unit.
     first : mapping of str to float
-        The first value of each of them.
+        Where each of them is as the first record begins.
     temperatures : tuple of str
         Channels in °C, whether they move or not: a tank of coolant stays as it is.
     zeroed : frozenset of str

@@ -1,0 +1,134 @@
+"""An effect that began within the record is looked for in the time since then."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.diagnose.change import changed_at
+from compensator.diagnose.onset import explains_better, onset_in
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import draw, record
+
+QUILL = load_model("quill")
+#: As `identify` states it: a base whose paths miss 0.6 µm.
+BASE = dataclasses.replace(QUILL, held_out_rms_um=0.6)
+BEGAN_H = 8.3
+
+
+def changed_on_the_way(scenarios, hours=24.0, began_h=BEGAN_H):
+    """Columns of a day in which effects begin after some hours."""
+    columns, _, _ = record([], 60, hours)
+    since, _, _ = record(scenarios, 60, hours)
+    hour = np.arange(columns["y_um"].size) / 60.0
+    return {"t_s": 3600.0 * hour, **columns, "y_um": np.where(hour < began_h, columns["y_um"], since["y_um"])}
+
+
+@pytest.fixture(scope="module")
+def columns():
+    return changed_on_the_way([draw("gain DTF", 2, 8.0)])
+
+
+@pytest.fixture(scope="module")
+def all_data(columns):
+    return tc.diagnose(QUILL, columns, all_data=True)
+
+
+@pytest.fixture(scope="module")
+def why(columns):
+    return tc.diagnose(QUILL, columns)
+
+
+def test_it_is_named_alone_and_when_it_began_is_said(columns, why):
+    assert why.verdict == "explained" and [(e.kind, e.path) for e in why.effects] == [("gain", "DTF")]
+    said = why.to_dict()
+    assert said["warning_codes"] == ["began_within"] and BEGAN_H < said["since_h"] < BEGAN_H + 1.0
+    assert f"Something began {said['since_h']:.1f} h after the start" in why.summary()
+    # Only what has been searched is shown and scored.
+    known = np.flatnonzero(np.isfinite(why.diagnosis.residual_after))
+    assert known[0] == round(60.0 * said["since_h"])
+    (searched,) = why.free_run
+    assert searched.samples == columns["y_um"].size - known[0]
+    assert searched.scores["extended model"].rms_about_mean_um < 0.1 * searched.scores["base model"].rms_about_mean_um
+
+
+def test_all_data_of_such_a_record_name_a_source(all_data):
+    assert "unobserved" in [effect.kind for effect in all_data.effects] and "since_h" not in all_data.to_dict()
+
+
+@pytest.fixture
+def found(all_data):
+    """The diagnosis of all data, which is searched again."""
+    assert onset_in(all_data.diagnosis) is not None
+    return all_data.diagnosis
+
+
+def of_run(found, *, used=None, back=False, **changes):
+    """A diagnosis with another run, whose residual may be the same backwards: an effect that ended."""
+    evidence, step = found.evidence, -1 if back else 1
+    (run,) = evidence.runs
+    run = dataclasses.replace(run, **changes)
+    used = evidence.used if used is None else used
+    evidence = dataclasses.replace(evidence, runs=(run,), residual=evidence.residual[::step], used=used)
+    return dataclasses.replace(found, evidence=evidence)
+
+
+def test_what_is_explained_and_what_ended_is_not_searched_again(found, why):
+    assert onset_in(why.diagnosis) is None  # explained well
+    assert onset_in(dataclasses.replace(found, verdict="explained", effects=())) is None  # by what is never deployed
+    assert onset_in(of_run(found, back=True)) is None
+
+
+def test_behind_a_gap_no_onset_is_looked_for(found):
+    evidence = found.evidence
+    parts = dataclasses.replace(evidence, runs=2 * evidence.runs)
+    assert onset_in(dataclasses.replace(found, evidence=parts)) is None
+
+
+def test_it_must_have_been_measured_for_8_h_since(found):
+    run = found.evidence.runs[0]
+    hours = run.t_s / 3600.0
+    assert onset_in(of_run(found, used=found.evidence.used & (hours < BEGAN_H + 10.0))) is not None
+    assert onset_in(of_run(found, used=found.evidence.used & (hours < BEGAN_H + 8.0))) is None
+
+
+def test_hours_count_from_the_start_of_the_data(found):
+    (run,) = found.evidence.runs
+    first, later = onset_in(found), onset_in(of_run(found, t_s=run.t_s + 3600.0))
+    assert later.since_h == first.since_h + 1.0
+
+
+@pytest.mark.parametrize(("part", "is_better"), [(0.5, True), (0.7, False)])
+def test_it_must_explain_itself_clearly_better(all_data, why, part, is_better):
+    later = dataclasses.replace(why.diagnosis, held_out_after=part * why.diagnosis.held_out_before)
+    assert explains_better(later, all_data.diagnosis) is is_better
+
+
+def test_it_must_be_deployed_and_determined(all_data, why):
+    later, others = why.diagnosis, all_data.diagnosis.effects
+    assert explains_better(later, all_data.diagnosis)
+    (effect,) = later.effects
+    loose = dataclasses.replace(effect.effect, std={"change": 9.0})
+    assert not all(one.deployable for one in others)
+    for effects in (others, (), (dataclasses.replace(effect, effect=loose),)):  # the second: a remainder alone
+        assert not explains_better(dataclasses.replace(later, effects=effects), all_data.diagnosis)
+
+
+def test_an_input_that_began_takes_no_source_in_its_place():
+    why = tc.diagnose(BASE, changed_on_the_way([draw("input", 3, 8.0)]))
+    assert [(e.kind, e.channel) for e in why.effects] == [("input", "spindle_rpm")] and why.verdict == "explained"
+
+
+def test_a_change_to_less_is_no_beginning():
+    minutes = np.arange(2000.0)
+    residual = np.where(minutes < 1200, 5.0, 0.1) * np.sin(minutes / 50.0)
+    assert changed_at(60.0 * minutes, residual, 0.1) is not None
+    assert changed_at(60.0 * minutes, residual, 0.1, quiet=0.5) is None
+    assert changed_at(60.0 * minutes, residual[::-1], 0.1, quiet=0.5) == 60.0 * 780  # the block in which it is
+
+
+def test_a_residual_that_stands_still_from_some_time_on_has_changed():
+    minutes = np.arange(2000.0)
+    residual = np.where(minutes < 1200, np.sin(minutes / 50.0), 0.3)
+    assert changed_at(60.0 * minutes, residual, 0.1) == 60.0 * 1200
