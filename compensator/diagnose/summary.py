@@ -201,7 +201,7 @@ def headline(found: Mapping[str, Any]) -> str:
             f"Error on held-out data: {found['before']['rms_um']:.2f} µm rms without {it}, {named_rms(found):.2f} with "
             f"{it}{_with_remainder(found)}."
         )
-    return f"{_names(found['effects'])}. {_words(found)} {error}{share}"
+    return f"{_names(found['effects'])}{_since(found)}. {_words(found)} {error}{share}"
 
 
 def verdict(found: Mapping[str, Any]) -> str:
@@ -215,11 +215,17 @@ def verdict(found: Mapping[str, Any]) -> str:
     share = "".join(f" {sentence}" for sentence in (explained(found), free_run_sentence(found)) if sentence)
     if not found["effects"]:
         return _residual(found) + share
+    named = f"{_names(found['effects'])}{_since(found)}"
     return (
-        f"{_words(found)} {_names(found['effects'])}. On held-out data, with a fitted zero, the residual was "
+        f"{_words(found)} {named}. On held-out data, with a fitted zero, the residual was "
         f"{found['before']['rms_um']:.2f} µm rms without and is {named_rms(found):.2f} µm rms with them"
         f"{_with_remainder(found)} (sensor noise {found['noise_floor_um']:.2f}).{share}"
     )
+
+
+def _since(found: Mapping[str, Any]) -> str:
+    """Return since when the effects act, where they began within the data."""
+    return f", began within the data: searched from {found['since_h']:.1f} h on" if found.get("since_h") else ""
 
 
 def _residual(found: Mapping[str, Any]) -> str:

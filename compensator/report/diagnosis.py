@@ -147,8 +147,8 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         lines=tuple(lines),
         edges=time.runs,
         below=below,
-        note="Residual in all data, zero and initial state as fitted with everything found. What lies between it and "
-        "the effects is what these do not explain."
+        note="Residual in the data that were searched, zero and initial state as fitted with everything found. What lies "
+        "between it and the effects is what these do not explain."
         + (" Below: the inputs of the effects." if below else " No channel shows the cause.")
         + time.note,
     )
@@ -197,7 +197,7 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
         for label, unit, values in causes
     )
     rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
-    note = f"Residual in all data without every other effect.{rest}"
+    note = f"Residual in the data that were searched, without every other effect.{rest}"
     return Figure(
         title=f"{name(effect)} in the residual",
         x_label="time, h",

@@ -8,6 +8,7 @@ import pytest
 import compensator as tc
 from compensator.diagnose.change import changed_at
 from compensator.diagnose.onset import explains_better, onset_in
+from compensator.diagnose.summary import headline
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 
@@ -45,6 +46,7 @@ def test_it_is_named_alone_and_when_it_began_is_said(columns, why):
     said = why.to_dict()
     assert said["warning_codes"] == ["began_within"] and BEGAN_H < said["since_h"] < BEGAN_H + 1.0
     assert f"Something began {said['since_h']:.1f} h after the start" in why.summary()
+    assert f"Gain: DTF, began within the data: searched from {said['since_h']:.1f} h on." in headline(said)
     # Only what has been searched is shown and scored.
     known = np.flatnonzero(np.isfinite(why.diagnosis.residual_after))
     assert known[0] == round(60.0 * said["since_h"])
