@@ -147,8 +147,8 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         lines=tuple(lines),
         edges=time.runs,
         below=below,
-        note="Residual in the data that were searched, zero and initial state as fitted with everything found. What lies "
-        "between it and the effects is what these do not explain."
+        note="Residual in the data that were searched, zero and initial state as fitted with everything found. What "
+        "lies between it and the effects is what these do not explain."
         + (" Below: the inputs of the effects." if below else " No channel shows the cause.")
         + time.note,
     )
