@@ -126,7 +126,7 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     if fit := found.get("fit"):
         named = fit["named_um"] if found["effects"] else fit["before_um"]
         figures += f" In the fit to all data: {named:.2f} and {fit['after_um']:.2f}."
-    deployed = _why_deployed(rest, named=bool(found["effects"]), hidden=is_hidden(found))
+    deployed = _why_deployed(found)
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
         figures,
@@ -141,20 +141,20 @@ def _part(rest: Mapping[str, Any]) -> str:
     return "" if share > 0.99 else f"{100.0 * share:.0f} % of "
 
 
-def _why_deployed(rest: Mapping[str, Any], *, named: bool, hidden: bool) -> str:
+def _why_deployed(found: Mapping[str, Any]) -> str:
     """Return that a remainder is deployed, and why, where held-out data alone would not say so."""
-    deployed = "Deployed in the extended model"
+    rest, deployed = found["remainder"], "Deployed in the extended model"
     if rest.get("belongs"):
         place, beside = "", ""
         if rest.get("instead"):
             place = " in place of the named effects"
-        elif named:
+        elif found["effects"]:
             place, beside = " with the named effects", " that they were fitted beside"
         return (
             f"{deployed}{place}: it is {_part(rest)}the base model's own error{beside}, as much of it as predicts "
             "held-out data best."
         )
-    if rest.get("instead") and hidden:
+    if rest.get("instead") and is_hidden(found):
         why = "because it leaves far less of these data in free run"
         return f"{deployed} in place of the source, which nothing foretells, {why}."
     if rest.get("instead"):

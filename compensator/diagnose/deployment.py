@@ -193,7 +193,7 @@ def _by_channels(
 
 def _is_confirmed(instead: Findings, found: Findings, held_out: HeldOut) -> bool:
     """Return whether all channels, in the place of what was found, are confirmed clearly."""
-    if found.terms and not any(term.effect.observed for term in found.terms):
+    if found.is_hidden:
         if in_free_run(instead)[1] >= SHOWS_HIDDEN * min(in_free_run(found)):
             return False
         if _hours(found) >= DAY_H:

@@ -103,6 +103,11 @@ class Findings:
         return self.search.criterion.leaves_noise(self.selection.before)
 
     @property
+    def is_hidden(self) -> bool:
+        """Whether all that is named is a source that no channel shows."""
+        return bool(self.terms) and not any(term.effect.observed for term in self.terms)
+
+    @property
     def is_own_error_alone(self) -> bool:
         """Whether the own error is deployed without effects beside it."""
         return self.belongs and not (self.terms and self.explains)
@@ -202,11 +207,13 @@ def by_channels(found: Findings) -> Findings | None:
     what has no name, and where all channels are worse.
     """
     evidence = found.search.evidence
-    if any(term.effect.observed for term in found.terms):
+    if not found.terms:
+        stays = found.remainder is not None
+    elif found.is_hidden:
+        stays = False
+    else:
         known = _log_evidence(found.selection.before)
         stays = _is_no_worse(found) or not _is_worth_deploying(found.channels, known, evidence)
-    else:
-        stays = not found.terms and found.remainder is not None
     if evidence.is_sparse or stays:
         return None
     explains = not found.terms

@@ -9,7 +9,7 @@ from compensator.diagnose.outcome import Diagnosis
 
 
 def series_of(diagnosis: Diagnosis) -> dict[str, Vector]:
-    """Return the curves by name, each of shape (n,), one row for each sample; NaN where Y is missing.
+    """Return the curves by name, each of shape (n,), one row for each sample; NaN where Y is missing or not searched.
 
     `run` counts from 1, `t_s` is the time in it. `residual_…` are of the fit to all data, `held_out_…` of searches that
     did not see the sample, `effect_1_um` is what the first effect adds to Y (0 where it is left in), `remainder_um`
