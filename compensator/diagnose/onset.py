@@ -4,7 +4,8 @@ No effect has an onset of its own, so one that began on the third day explains n
 shows, or another channel, takes its place. Where the base model was right until some time and errs since, and the whole
 of the record is not explained well, the search is done once more with measured Y of the time since. T_Q, AT and the
 channels of the time before still set the state. What that finds is taken if it leaves clearly less of its own held-out
-blocks, and all of it can be deployed.
+blocks, and all of it can be deployed. So is a drift of the measurement that explains everything, in the place of names
+that would be deployed: a channel that went the same way once must not be taken for it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from compensator.data.runs import Run
 from compensator.diagnose.change import BLOCK_MIN, changed_at
 from compensator.diagnose.deployment import SHORT_H
 from compensator.diagnose.outcome import Diagnosis
+from compensator.model.effects.passing import Periodic
 
 #: The model was right before if its error varied by less than this part of what it has varied by since.
 QUIET = 0.5
@@ -53,8 +55,7 @@ def onset_in(found: Diagnosis) -> Onset | None:
     Behind a gap the zero and the state are unknown, which looks like an onset: data with one are searched as they are.
     """
     evidence = found.evidence
-    is_of_measurement = found.verdict == "explained" and not any(effect.deployable for effect in found.effects)
-    if evidence.is_sparse or evidence.free_paths or len(evidence.runs) > 1 or is_of_measurement:
+    if evidence.is_sparse or evidence.free_paths or len(evidence.runs) > 1 or _is_of_measurement(found):
         return None
     if left_part(found) <= WELL_EXPLAINED:
         return None
@@ -78,17 +79,33 @@ def onset_in(found: Diagnosis) -> Onset | None:
 
 def explains_better(later: Diagnosis, all_data: Diagnosis) -> bool:
     """Return whether the time since an effect began explains itself clearly better than all of the data do."""
-    is_deployed = bool(later.effects) and all(effect.deployable and effect.is_determined for effect in later.effects)
-    return is_deployed and left_part(later) < CLEARLY_BETTER * min(left_part(all_data), 1.0)
+    left = math.inf
+    if _is_of_measurement(later):
+        # A period that has come once or twice looks like anything slow.
+        is_period = any(isinstance(effect.effect, Periodic) for effect in later.effects)
+        if not is_period and any(effect.deployable for effect in all_data.effects):
+            left = _part(later, later.named.rms_um)
+    elif later.effects and all(effect.effect.deployable and effect.is_determined for effect in later.effects):
+        left = left_part(later)
+    return left < CLEARLY_BETTER * min(left_part(all_data), 1.0)
+
+
+def _is_of_measurement(found: Diagnosis) -> bool:
+    """Return whether errors of the measurement explain all of it."""
+    return found.verdict == "explained" and not any(effect.effect.deployable for effect in found.effects)
 
 
 def left_part(found: Diagnosis) -> float:
     """Return which part of the error on held-out data a diagnosis leaves; infinite if nothing is deployed."""
     if found.shows_nothing:
         return 0.0
-    before_um, after_um, floor_um = found.before.rms_um, found.after.rms_um, found.noise_floor_um
     if len(found.model.effects) == len(found.evidence.model.effects):
         return math.inf
+    return _part(found, found.after.rms_um)
+
+
+def _part(found: Diagnosis, after_um: float) -> float:
+    before_um, floor_um = found.before.rms_um, found.noise_floor_um
     if not before_um > floor_um:
         return 1.0
     return math.sqrt(max(after_um**2 - floor_um**2, 0.0) / (before_um**2 - floor_um**2))

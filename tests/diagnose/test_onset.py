@@ -117,6 +117,25 @@ def test_it_must_be_deployed_and_determined(all_data, why):
         assert not explains_better(dataclasses.replace(later, effects=effects), all_data.diagnosis)
 
 
+def test_names_in_whose_place_all_channels_are_deployed_count_as_deployed(all_data, why):
+    later = why.diagnosis
+    replaced = dataclasses.replace(later, effects=tuple(dataclasses.replace(e, replaced=True) for e in later.effects))
+    assert not any(effect.deployable for effect in replaced.effects)
+    assert explains_better(replaced, all_data.diagnosis)
+
+
+@pytest.mark.parametrize(("kind", "is_better"), [("drift", True), ("periodic", False)])
+def test_a_drift_since_takes_the_place_of_what_would_be_deployed(all_data, why, kind, is_better):
+    since = tc.diagnose(QUILL, changed_on_the_way([draw(kind, 3, 8.0)], began_h=0.0)).diagnosis
+    assert since.verdict == "explained" and [effect.effect.kind for effect in since.effects] == [kind]
+    found = why.diagnosis
+    hardly = dataclasses.replace(found, held_out_after=0.5 * found.held_out_before)
+    assert explains_better(since, hardly) is is_better
+    assert not explains_better(since, dataclasses.replace(found, held_out_after=0.0 * found.held_out_before))
+    # In the place of a source that no channel shows it is no better name.
+    assert not explains_better(since, all_data.diagnosis)
+
+
 def test_an_input_that_began_takes_no_source_in_its_place():
     why = tc.diagnose(BASE, changed_on_the_way([draw("input", 3, 8.0)]))
     assert [(e.kind, e.channel) for e in why.effects] == [("input", "spindle_rpm")] and why.verdict == "explained"
