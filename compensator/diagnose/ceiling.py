@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from compensator.diagnose.standing import is_hidden
+from compensator.diagnose.standing import held_by_the_base, is_hidden
 from compensator.display import Words
 
 #: Named effects that explain less than this of what the channels explain fall short of it, %. It is what an engineer
@@ -46,6 +46,8 @@ def explained(found: Mapping[str, Any]) -> str:
     share = found["ceiling"]["explained_pct"]
     if not found["effects"]:
         return "No named effect explains what the channels can explain."
+    if share < 0.5 and held_by_the_base(found):
+        return "The named effects explain it only together with the base model's own error."
     how_much = "all" if share > 99.5 else "nothing" if share < 0.5 else f"{share:.0f} %"
     return f"The named effects explain {how_much} of what the channels can explain."
 

@@ -144,7 +144,11 @@ class Criterion:
             return True
         effect, approximate = term.hypothesis.effect, self._evidence.context.approximate
         others, without_um2 = len(fit.terms) > 1, self.rms(without.terms) ** 2
-        if approximate and not others and without_um2 - self.rms(fit.terms) ** 2 < effect.removes_alone * without_um2:
+        removed_um2 = without_um2 - self.rms(fit.terms) ** 2
+        if term.hypothesis.acts_by_temperature:
+            # The base has the part of it that heat and ambient make: that alone makes more of the error, not less.
+            removed_um2 = max(removed_um2, self.compared(without) ** 2 - self.compared(fit) ** 2)
+        if approximate and not others and removed_um2 < effect.removes_alone * without_um2:
             return False
         share = effect.worth_with_others if approximate and others else effect.worth
         added = np.where(self._evidence.used, response(self._evidence, term), 0.0)

@@ -32,9 +32,9 @@ LOWERS_CLEARLY = 0.75
 #: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
 #: any slow channel.
 LOWERS_BY_FAR = 0.6
-#: In the place of a source that no channel shows they leave less than this share of the error in free run: where it
-#: acts once in each block, held-out blocks refute everything. In less than a day, h, whatever is slow happens once, and
-#: held-out blocks must confirm them, too.
+#: In the place of a source that no channel shows, or of names that are refused, they leave less than this share of the
+#: error in free run: where it acts once in each block, held-out blocks refute everything. In less than a day, h,
+#: whatever is slow happens once, and held-out blocks must confirm them, too.
 SHOWS_HIDDEN, DAY_H = 0.4, 23.0
 #: From a record shorter than this, h, a model with an error of its own is extended only by names that leave noise, or
 #: that held-out blocks confirm with no parameter smaller than its error.
@@ -103,9 +103,13 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
     held_out : HeldOut
         Errors on held-out blocks.
     """
-    found, effects, held_out = _with_remainder_that_helps(found, effects, held_out)
-    found, effects, held_out = _by_channels(found, effects, held_out)
-    decided = Deployment(
+    decided = _decided(*_with_remainder_that_helps(found, effects, held_out))
+    decided = _by_channels(decided) or decided
+    return dataclasses.replace(decided, effects=_not_replaced(decided.effects)) if decided.is_refused else decided
+
+
+def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut) -> Deployment:
+    return Deployment(
         found=found,
         effects=effects,
         held_out=held_out,
@@ -113,7 +117,6 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
         worse_um=_worse_in_free_run(found),
         too_short_h=_too_short_h(found, effects, held_out),
     )
-    return dataclasses.replace(decided, effects=_not_replaced(effects)) if decided.is_refused else decided
 
 
 def is_adequate(found: Findings, held_out: HeldOut) -> bool:
@@ -180,24 +183,24 @@ def _as_far_as_confirmed(
     return found, effects, dataclasses.replace(held_out, whole=whole)
 
 
-def _by_channels(
-    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
-) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+def _by_channels(decided: Deployment) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
-    instead = by_channels(found)
-    if instead is None or not _is_confirmed(instead, found, held_out):
-        return found, effects, held_out
-    effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in effects)
-    return instead, effects, dataclasses.replace(held_out, whole=held_out.ceiling)
+    helps_nothing = decided.contradicted or decided.reverses_path or decided.found.is_hidden
+    instead = by_channels(decided.found, helps_nothing=helps_nothing)
+    if instead is None or not _is_confirmed(instead, decided, helps_nothing=helps_nothing):
+        return None
+    effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in decided.effects)
+    return _decided(instead, effects, dataclasses.replace(decided.held_out, whole=decided.held_out.ceiling))
 
 
-def _is_confirmed(instead: Findings, found: Findings, held_out: HeldOut) -> bool:
+def _is_confirmed(instead: Findings, decided: Deployment, *, helps_nothing: bool) -> bool:
     """Return whether all channels, in the place of what was found, are confirmed clearly."""
-    if found.is_hidden:
-        if in_free_run(instead)[1] >= SHOWS_HIDDEN * min(in_free_run(found)):
-            return False
-        if _hours(found) >= DAY_H:
-            return True
+    found, held_out = decided.found, decided.held_out
+    if helps_nothing:
+        base_um, own_um = in_free_run(found)
+        is_shown = in_free_run(instead)[1] < SHOWS_HIDDEN * (base_um if decided.is_refused else min(base_um, own_um))
+        if _hours(found) >= DAY_H or not is_shown:
+            return is_shown
     whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
     lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
     # What is not known, in a record without a block to hold out, confirms nothing.

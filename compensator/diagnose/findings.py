@@ -104,8 +104,9 @@ class Findings:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether all that is named is a source that no channel shows."""
-        return bool(self.terms) and not any(term.effect.observed for term in self.terms)
+        """Whether a source that no channel shows is named, and nothing that can be deployed beside it."""
+        hides = any(not term.effect.observed for term in self.terms)
+        return hides and not any(term.effect.deployable for term in self.terms)
 
     @property
     def is_own_error_alone(self) -> bool:
@@ -198,7 +199,7 @@ def _is_surpassed(found: Findings) -> bool:
     )
 
 
-def by_channels(found: Findings) -> Findings | None:
+def by_channels(found: Findings, *, helps_nothing: bool) -> Findings | None:
     """Return findings with all channels in the place of names that gain nothing in free run, or of none.
 
     Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect, and a
@@ -209,7 +210,7 @@ def by_channels(found: Findings) -> Findings | None:
     evidence = found.search.evidence
     if not found.terms:
         stays = found.remainder is not None
-    elif found.is_hidden:
+    elif helps_nothing:
         stays = False
     else:
         known = _log_evidence(found.selection.before)

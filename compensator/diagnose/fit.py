@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -265,7 +266,12 @@ def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix],
 
 
 def settled(fit: Fit) -> Fit:
-    """Return a fit with the rest that fits its effects best, and errors of form as effects of their size have."""
+    """Return a fit with the rest that fits its effects best, and errors of form as effects of their size have.
+
+    Heat and ambient temperature move other temperatures, too. What that does to Y was there when the base was
+    calibrated: its paths have it already. So beside an effect by a temperature the paths' own error may be as large as
+    that part of the effect, where the data speak for it; to foretell other days it always is.
+    """
     points = fit.likelihood.points
     sizes: dict[str, float] = {}
     for term in fit.terms:
@@ -274,8 +280,24 @@ def settled(fit: Fit) -> Fit:
             of = "" if path else channel
             added = response(points.evidence, term)[points.evidence.used]
             sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
-    rest = learned_rest(points, fit.columns, fit.fixed, points.with_forms_of(fit.rest, sizes))
-    return fit_terms(Likelihood(points, rest), fit.starts())
+    rests = [points.with_forms_of(fit.rest, sizes)]
+    carried_um = math.hypot(*(_carried_um(fit, term) for term in fit.terms if term.hypothesis.acts_by_temperature))
+    if carried_um and not points.is_exact:
+        more = dataclasses.replace(rests[0], own_um=math.hypot(rests[0].own_um, carried_um))
+        rests = [more] if points.foretells else [*rests, more]
+    learned = [learned_rest(points, fit.columns, fit.fixed, rest) for rest in rests]
+    fits = [fit_terms(Likelihood(points, rest), fit.starts()) for rest in learned]
+    return max(fits, key=lambda one: one.log_evidence)
+
+
+def _carried_um(fit: Fit, term: Term) -> float:
+    """Return how much of what an effect adds responses of the base's paths explain, standard deviation in µm."""
+    points = fit.likelihood.points
+    added = points.averaged(response(points.evidence, term)[:, None])
+    table = np.concatenate([points.fast, points.slow], axis=1)
+    table = table - table.mean(axis=0)
+    explained = table @ np.linalg.lstsq(table, added - added.mean(), rcond=None)[0]
+    return float(np.std(explained))
 
 
 def to_search(free: Free, value: float) -> float:

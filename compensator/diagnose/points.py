@@ -127,7 +127,7 @@ class Points:
     """
 
     def __init__(self, evidence: Evidence, *, foretells: bool = False) -> None:
-        self.evidence, self._foretells = evidence, foretells
+        self.evidence, self.foretells = evidence, foretells
         context = evidence.context
         self.is_exact = not context.approximate or evidence.free_paths
         # The same for all data and for what is left where something is held out.
@@ -162,7 +162,7 @@ class Points:
 
     def of(self, evidence: Evidence, *, foretells: bool | None = None) -> Points:
         """Return the points of other evidence, or those of it that foretell."""
-        return Points(evidence, foretells=self._foretells if foretells is None else foretells)
+        return Points(evidence, foretells=self.foretells if foretells is None else foretells)
 
     def _own_um(self) -> float:
         evidence = self.evidence
@@ -223,7 +223,7 @@ class Points:
             How many of the columns belong to one effect.
         """
         spread = np.std(points, axis=0)
-        if self._foretells:
+        if self.foretells:
             spread = np.full(spread.shape, np.max(spread, initial=0.0))
         spread[spread < 1e-12] = 1.0
         scale = self.spread_um / spread
@@ -308,7 +308,7 @@ class Points:
         """Return the lags of any linear path, and a drive behind each of them."""
         context = self.evidence.context
         lags = lags_of_paths(context)
-        lag = lag_or_none if self._foretells else Lag
+        lag = lag_or_none if self.foretells else Lag
         bank = FilterBank(lags, [(1.0,) * len(lags)], context.period_min, lag)
         return np.array(lags), self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
 
@@ -317,11 +317,11 @@ class Points:
         table = table @ gains
         if not table.shape[1]:
             return table, gains
-        scale = 1.0 if self._foretells else 1.0 / np.maximum(np.std(table, axis=0), 1e-12)
+        scale = 1.0 if self.foretells else 1.0 / np.maximum(np.std(table, axis=0), 1e-12)
         table, gains = table * scale, gains * scale
         _, sizes, directions = np.linalg.svd(table - table.mean(axis=0), full_matrices=False)
         kept = sizes > DISTINCT * sizes[0]
-        together = np.linalg.norm(sizes) if self._foretells else sizes[kept] * math.sqrt(kept.sum())
+        together = np.linalg.norm(sizes) if self.foretells else sizes[kept] * math.sqrt(kept.sum())
         combined = directions[kept].T / np.maximum(together, 1e-12) * math.sqrt(self.count)
         return table @ combined, gains @ combined
 

@@ -11,6 +11,8 @@ from typing import Any
 
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
 from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.model.effects.hypothesis import DEGC
+from compensator.model.effects.input import Input
 from compensator.model.effects.unobserved import Unobserved
 
 #: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
@@ -75,6 +77,15 @@ def is_hidden(found: Mapping[str, Any]) -> bool:
     return bool(found["effects"]) and all(effect["kind"] == Unobserved.kind for effect in found["effects"])
 
 
+def held_by_the_base(found: Mapping[str, Any]) -> list[str]:
+    """Return the temperatures that act beside the base's own error: it has what heat and ambient do by them already."""
+    rest = found.get("remainder") or {}
+    if not rest.get("belongs") or rest.get("instead"):
+        return []
+    channels = [effect.get("channel") or "" for effect in found["effects"] if effect["kind"] == Input.kind]
+    return [channel for channel in channels if channel.endswith(DEGC)]
+
+
 def words(found: Mapping[str, Any]) -> str:
     """Return what is said of the named effects beyond the verdict in one word; empty where that says all.
 
@@ -127,6 +138,12 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
         return (
             f"What is named resembles the cause most: {left}. A regularised response does better: the remainder, which "
             f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
+        )
+    if channels := held_by_the_base(found):
+        return (
+            f"What was found explains the error in part: {left}. Heat and ambient move {' and '.join(channels)}, too, "
+            "and the base model has what that does already: with its own error corrected, "
+            f"{fit['after_um']:.2f} is left."
         )
     return (
         f"What was found explains the error in part: {left}. The remainder, which explains nothing, corrects that to "

@@ -12,8 +12,9 @@ import pytest
 import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
+from compensator.diagnose import deployment
 from compensator.diagnose import findings as module
-from compensator.diagnose.deployment import _by_channels
+from compensator.diagnose.deployment import _by_channels, _decided
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
 from compensator.diagnose.outcome import warnings_of
@@ -146,9 +147,9 @@ def called_late() -> Findings:
 def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(called_late: Findings) -> None:
     before_um, after_um = in_free_run(called_late)
     assert called_late.explains and after_um > before_um
-    instead = by_channels(called_late)
+    instead = by_channels(called_late, helps_nothing=False)
     assert instead is not None and not instead.explains and instead.terms == called_late.terms
-    assert in_free_run(instead)[1] < 0.5 * before_um and by_channels(instead) is None
+    assert in_free_run(instead)[1] < 0.5 * before_um and by_channels(instead, helps_nothing=False) is None
 
 
 @pytest.mark.parametrize(
@@ -162,10 +163,26 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
     held_out = held_out_errors(ones, named=named, whole=named, ceiling=channels_um * ones)
     # Where an own error beside the names was confirmed in part, all of the channels are deployed.
     called_late = dataclasses.replace(called_late, confirmed=0.4)
-    found, _, judged = _by_channels(called_late, (), held_out)
-    assert found.confirmed == (0.4 if found is called_late else 1.0)
-    assert found.explains is not is_confirmed
-    assert judged.whole[0] == (channels_um if is_confirmed else named_um)
+    instead = _by_channels(_decided(called_late, (), held_out))
+    assert (instead is not None) is is_confirmed
+    if instead:
+        assert instead.found.confirmed == 1.0 and not instead.found.explains
+        assert instead.held_out.whole[0] == channels_um
+
+
+@pytest.mark.parametrize(("limit", "is_shown"), [(0.1, False), (0.6, True)])
+def test_all_channels_take_the_place_of_names_that_held_out_data_refute(
+    called_late: Findings, limit: float, is_shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a cause acts in each block for the first time, held-out data refute everything: free run decides."""
+    monkeypatch.setattr(deployment, "SHOWS_HIDDEN", limit)
+    monkeypatch.setattr(deployment, "DAY_H", 5.0)
+    ones = np.ones(called_late.ceiling.size)
+    held_out = held_out_errors(ones, named=3.0 * ones, whole=3.0 * ones, ceiling=2.0 * ones)
+    decided = _decided(called_late, (), held_out)
+    assert decided.contradicted and decided.is_refused
+    instead = _by_channels(decided)
+    assert (instead is not None) is is_shown and not (instead and instead.contradicted)
 
 
 def test_a_name_that_no_part_of_a_record_shows_is_deployed_and_not_called_confirmed() -> None:

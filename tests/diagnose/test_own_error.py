@@ -19,7 +19,7 @@ from compensator.diagnose.search import Search
 from compensator.diagnose.summary import figures
 from compensator.model.model_file import load_model
 from sim_hardware.drawn_machines.cases import _cases
-from tests.diagnose.scenarios import draw, errors_on_another_day, held_out_errors, record
+from tests.diagnose.scenarios import draw, errors_on_another_day, held_out_errors, lag, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -85,6 +85,29 @@ def test_a_model_with_it_errs_less_on_another_day(scenarios):
         error = true - tc.simulate(model, {"t_s": 60.0 * np.arange(true.size), **fresh})["y_pred_um"]
         errors.append(np.std(error))
     assert errors[0] < 0.7 * errors[1]
+
+
+def warmed_bed(seed):
+    """A day and a half in which a bed acts on Y by what a floor adds to it; heat and ambient move it, too."""
+    columns, true, _ = record([], seed, 36.0)
+    n, rng = true.size, np.random.default_rng(seed)
+    floor = 3.0 * lag(lag(np.repeat(rng.normal(size=n // 180 + 1), 180)[:n], 60.0), 30.0)
+    heat, ambient = columns["t_q_degc"] - columns["at_degc"], columns["at_degc"]
+    bed = 20.0 + 0.4 * lag(heat, 90.0) + 0.5 * lag(ambient, 150.0) + floor + rng.normal(0.0, 0.05, n)
+    effect = 4.0 * lag(floor, 20.0)
+    y_um = columns["y_um"] + effect
+    return {"t_s": 60.0 * np.arange(n), **columns, "bed_degc": bed, "y_um": y_um}, true + effect
+
+
+def test_a_temperature_that_heat_moves_too_acts_by_what_the_base_does_not_have():
+    why = tc.diagnose(BASE, warmed_bed(22)[0])
+    (effect,) = why.effects
+    assert (effect.kind, effect.channel) == ("input", "bed_degc")
+    assert effect.parameters["gain_um_per_k"]["value"] == pytest.approx(4.0, rel=0.1)
+    fresh, true = warmed_bed(32)
+    before, after = (np.std(true - tc.simulate(model, fresh)["y_pred_um"]) for model in (BASE, why.model))
+    assert after < 0.04 * before
+    assert "Heat and ambient move bed_degc, too, and the base model has what that does already" in why.summary()
 
 
 def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensator.diagnose.ceiling import ceiling, remainder
+from compensator.diagnose.ceiling import ceiling, explained, remainder
 from compensator.diagnose.diagnosis import _ceiling
 from compensator.diagnose.found_effect import FoundEffect, rivals_of
 from compensator.diagnose.standing import verdict_of
@@ -109,6 +109,11 @@ def test_where_the_remainder_does_the_work_it_is_said() -> None:
     assert "it is the base model's own error" in remainder(table)[0].text()
     table["remainder"]["confirmed"] = 0.503
     assert "it is 50 % of the base model's own error" in remainder(table)[0].text()
+    coolant = table["effects"][0] | {"kind": "input", "path": None, "channel": "coolant_degc"}
+    together = table | {"effects": [coolant]}
+    assert "Heat and ambient move coolant_degc, too" in headline(together) and "0.16 is left." in headline(together)
+    best = {"rms_um": 1.0, "explained_pct": 0.0}
+    assert explained(together | {"before": {"rms_um": 5.0}, "ceiling": best}).endswith("base model's own error.")
     other = found(verdict="partly_explained", remainder=rest | {"instead": True}, fit=fit)
     assert "is deployed in its place" in headline(other)
 

@@ -98,6 +98,12 @@ class Hypothesis:
         return self.effect.kind, self.path or self.effect.path, self.effect.channel
 
     @property
+    def acts_by_temperature(self) -> bool:
+        """Whether a measured temperature acts, and by no path of the base."""
+        _, path, channel = self.place
+        return not path and channel.endswith(DEGC)
+
+    @property
     def label(self) -> str:
         """Kind, place and form in words."""
         return " ".join(filter(None, (*self.place, f"({self.form})" if self.form else "")))
