@@ -185,7 +185,9 @@ def _as_far_as_confirmed(
 
 def _by_channels(decided: Deployment) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
-    helps_nothing = decided.contradicted or decided.reverses_path or decided.found.is_hidden
+    # Paths that were fitted anew would stay, and they are what is contradicted.
+    is_refuted = decided.contradicted and not decided.found.search.evidence.free_paths
+    helps_nothing = is_refuted or decided.reverses_path or decided.found.is_hidden
     instead = by_channels(decided.found, helps_nothing=helps_nothing)
     if instead is None or not _is_confirmed(instead, decided, helps_nothing=helps_nothing):
         return None

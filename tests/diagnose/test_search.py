@@ -190,7 +190,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     def worse(*arguments):
         errors = held_out(*arguments)
         wrong = times * errors.nothing
-        return dataclasses.replace(errors, named=wrong, whole=wrong)
+        return dataclasses.replace(errors, named=wrong, whole=wrong, ceiling=wrong)
 
     times = 1.5
 
