@@ -205,6 +205,10 @@ def _is_confirmed(instead: Findings, decided: Deployment, *, helps_nothing: bool
             return is_shown
     whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
     lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
+    base_um, own_um = in_free_run(found)
+    if late_term(found.selection.fit) is not None and own_um <= base_um:
+        # Its correction gains something, and what the channels gain before it must be more by far.
+        whole_um *= LOWERS_CLEARLY
     # What is not known, in a record without a block to hold out, confirms nothing.
     return rms_of(held_out.ceiling) <= min(whole_um, lowers * nothing_um)
 

@@ -205,12 +205,13 @@ def by_channels(found: Findings, *, helps_nothing: bool) -> Findings | None:
     Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect, and a
     source that no channel shows may warm a part with a sensor. And what has no name may be as small as the model's own
     error, and come again all the same. None where a name that a channel shows gains something, where a remainder is for
-    what has no name, and where all channels are worse.
+    what has no name, and where all channels are worse. The evidence for a late T_Q knows the future of the record: what
+    its correction gains in time, other channels may gain before.
     """
     evidence = found.search.evidence
     if not found.terms:
         stays = found.remainder is not None
-    elif helps_nothing:
+    elif helps_nothing or late_term(found.selection.fit) is not None:
         stays = False
     else:
         known = _log_evidence(found.selection.before)
