@@ -270,7 +270,8 @@ def settled(fit: Fit) -> Fit:
 
     Heat and ambient temperature move other temperatures, too. What that does to Y was there when the base was
     calibrated: its paths have it already. So beside an effect by a temperature the paths' own error may be as large as
-    that part of the effect, where the data speak for it; to foretell other days it always is.
+    that part of the effect, where the data speak for it; to foretell other days it always is. Not where the own error
+    is not deployed with effects: with few values, exact forms or a late T_Q.
     """
     points = fit.likelihood.points
     sizes: dict[str, float] = {}
@@ -282,7 +283,7 @@ def settled(fit: Fit) -> Fit:
             sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
     rests = [points.with_forms_of(fit.rest, sizes)]
     carried_um = math.hypot(*(_carried_um(fit, term) for term in fit.terms if term.hypothesis.acts_by_temperature))
-    if carried_um and not points.is_exact:
+    if carried_um and not (points.is_exact or points.evidence.is_sparse or late_term(fit)):
         more = dataclasses.replace(rests[0], own_um=math.hypot(rests[0].own_um, carried_um))
         rests = [more] if points.foretells else [*rests, more]
     learned = [learned_rest(points, fit.columns, fit.fixed, rest) for rest in rests]

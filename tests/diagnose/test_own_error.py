@@ -11,7 +11,7 @@ from compensator.diagnose import diagnosis
 from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.points import Points
@@ -108,6 +108,17 @@ def test_a_temperature_that_heat_moves_too_acts_by_what_the_base_does_not_have()
     before, after = (np.std(true - tc.simulate(model, fresh)["y_pred_um"]) for model in (BASE, why.model))
     assert after < 0.04 * before
     assert "Heat and ambient move bed_degc, too, and the base model has what that does already" in why.summary()
+
+
+def test_few_values_grant_no_own_error_that_is_not_deployed():
+    columns, _ = warmed_bed(22)
+    columns["y_um"][np.arange(columns["y_um"].size) % 60 != 0] = np.nan
+    evidence = evidence_of(BASE, runs_from({name: values for name, values in columns.items() if name != "t_s"}))
+    assert evidence.is_sparse
+    points = Points(evidence)
+    lag = next(h for h in Search(evidence).hypotheses if h.form == "lag" and h.effect.channel == "bed_degc")
+    fit = settled(fit_terms(Likelihood(points, points.typical_rest()), [(lag, (20.0,))]))
+    assert fit.rest.own_um < 1.1 * points.own_um
 
 
 def test_forms_that_are_exact_and_effects_of_the_measurement_have_none(scenarios):
