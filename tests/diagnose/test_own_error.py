@@ -115,7 +115,7 @@ def test_few_values_grant_no_own_error_that_is_not_deployed():
     columns["y_um"][np.arange(columns["y_um"].size) % 60 != 0] = np.nan
     evidence = evidence_of(BASE, runs_from({name: values for name, values in columns.items() if name != "t_s"}))
     assert evidence.is_sparse
-    points = Points(evidence)
+    points = Points(evidence, foretells=True)
     lag = next(h for h in Search(evidence).hypotheses if h.form == "lag" and h.effect.channel == "bed_degc")
     fit = settled(fit_terms(Likelihood(points, points.typical_rest()), [(lag, (20.0,))]))
     assert fit.rest.own_um < 1.1 * points.own_um
