@@ -187,18 +187,19 @@ def _by_channels(decided: Deployment) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
     # Paths that were fitted anew would stay, and they are what is contradicted.
     is_refuted = decided.contradicted and not decided.found.search.evidence.free_paths
-    helps_nothing = is_refuted or decided.reverses_path or decided.found.is_hidden
-    instead = by_channels(decided.found, helps_nothing=helps_nothing)
-    if instead is None or not _is_confirmed(instead, decided, helps_nothing=helps_nothing):
+    useless = is_refuted or decided.found.is_hidden
+    found = by_channels(decided.found, names_are_useless=useless)
+    if found is None or not _is_confirmed(found, decided, names_are_useless=useless):
         return None
     effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in decided.effects)
-    return _decided(instead, effects, dataclasses.replace(decided.held_out, whole=decided.held_out.ceiling))
+    instead = _decided(found, effects, dataclasses.replace(decided.held_out, whole=decided.held_out.ceiling))
+    return None if instead.is_refused else instead
 
 
-def _is_confirmed(instead: Findings, decided: Deployment, *, helps_nothing: bool) -> bool:
+def _is_confirmed(instead: Findings, decided: Deployment, *, names_are_useless: bool) -> bool:
     """Return whether all channels, in the place of what was found, are confirmed clearly."""
     found, held_out = decided.found, decided.held_out
-    if helps_nothing:
+    if names_are_useless:
         base_um, own_um = in_free_run(found)
         is_shown = in_free_run(instead)[1] < SHOWS_HIDDEN * (base_um if decided.is_refused else min(base_um, own_um))
         if _hours(found) >= DAY_H or not is_shown:
@@ -206,7 +207,7 @@ def _is_confirmed(instead: Findings, decided: Deployment, *, helps_nothing: bool
     whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
     lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
     base_um, own_um = in_free_run(found)
-    if late_term(found.selection.fit) is not None and own_um <= base_um:
+    if late_term(found.selection.fit) is not None and found.left_in is None and own_um <= base_um:
         # Its correction gains something, and what the channels gain before it must be more by far.
         whole_um *= LOWERS_CLEARLY
     # What is not known, in a record without a block to hold out, confirms nothing.

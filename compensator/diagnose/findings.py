@@ -11,7 +11,16 @@ from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN, MOSTLY
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, as_deployed, fit_terms, late_term, response, settled
+from compensator.diagnose.fit import (
+    Fit,
+    Term,
+    as_deployed,
+    fit_terms,
+    has_dead_time,
+    late_term,
+    response,
+    settled,
+)
 from compensator.diagnose.foresight import Foresight, foreseeing
 from compensator.diagnose.own_error import foretelling, own_error, own_error_alone
 from compensator.diagnose.scan import Grid
@@ -104,9 +113,8 @@ class Findings:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether a source that no channel shows is named, and nothing that can be deployed beside it."""
-        hides = any(not term.effect.observed for term in self.terms)
-        return hides and not any(term.effect.deployable for term in self.terms)
+        """Whether all that is named is a source that no channel shows."""
+        return bool(self.terms) and not any(term.effect.observed for term in self.terms)
 
     @property
     def is_own_error_alone(self) -> bool:
@@ -199,7 +207,7 @@ def _is_surpassed(found: Findings) -> bool:
     )
 
 
-def by_channels(found: Findings, *, helps_nothing: bool) -> Findings | None:
+def by_channels(found: Findings, *, names_are_useless: bool) -> Findings | None:
     """Return findings with all channels in the place of names that gain nothing in free run, or of none.
 
     Names may be right, and the engine can do nothing with them: what a late T_Q hides may be most of the effect, and a
@@ -207,11 +215,18 @@ def by_channels(found: Findings, *, helps_nothing: bool) -> Findings | None:
     error, and come again all the same. None where a name that a channel shows gains something, where a remainder is for
     what has no name, and where all channels are worse. The evidence for a late T_Q knows the future of the record: what
     its correction gains in time, other channels may gain before.
+
+    Parameters
+    ----------
+    found : Findings
+        Names, and what all channels explain.
+    names_are_useless : bool
+        Whether nothing is deployed by them anyhow: they are refused, or a source that no channel shows.
     """
     evidence = found.search.evidence
     if not found.terms:
         stays = found.remainder is not None
-    elif helps_nothing or late_term(found.selection.fit) is not None:
+    elif names_are_useless or (late_term(found.selection.fit) is not None and found.left_in is None):
         stays = False
     else:
         known = _log_evidence(found.selection.before)
@@ -366,14 +381,9 @@ def by_base(evidence: Evidence) -> Vector:
 
 
 def _has_own_error(fit: Fit) -> bool:
-    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact.
-
-    What the engine leaves of a dead time of T_Q is what it could not foretell, and no error of the paths.
-    """
-    points, late = fit.likelihood.points, late_term(fit)
-    deployable = any(term.effect.deployable for term in fit.terms)
-    foretold = late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
-    return deployable and not foretold and not points.is_exact and not points.evidence.is_sparse
+    """Return whether the own error is deployed beside effects: these can be, and neither paths nor forms are exact."""
+    points, deployable = fit.likelihood.points, any(term.effect.deployable for term in fit.terms)
+    return deployable and not has_dead_time(fit) and not points.is_exact and not points.evidence.is_sparse
 
 
 def _remainder(

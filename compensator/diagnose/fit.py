@@ -134,6 +134,12 @@ def late_term(fit: Fit) -> Term | None:
     return next((term for term in fit.terms if term.effect.lateness is not None), None)
 
 
+def has_dead_time(fit: Fit) -> bool:
+    """Return whether a late T_Q has a dead time: what the engine leaves of it is no error of the paths."""
+    late = late_term(fit)
+    return late is not None and late.effect.lateness is not None and late.effect.lateness.delay_min > 0.0
+
+
 def as_deployed(fit: Fit) -> tuple[tuple[Term, ...], list[Vector], Fit]:
     """Return the terms of a fit as the engine runs them, what each adds to y on every sample, µm, and their fit.
 
@@ -271,7 +277,7 @@ def settled(fit: Fit) -> Fit:
     Heat and ambient temperature move other temperatures, too. What that does to Y was there when the base was
     calibrated: its paths have it already. So beside an effect by a temperature the paths' own error may be as large as
     that part of the effect, where the data speak for it; to foretell other days it always is. Not where the own error
-    is not deployed with effects: with few values, exact forms or a late T_Q.
+    is not deployed with effects: with few values, exact forms or a dead time of T_Q.
     """
     points = fit.likelihood.points
     sizes: dict[str, float] = {}
@@ -283,7 +289,7 @@ def settled(fit: Fit) -> Fit:
             sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
     rests = [points.with_forms_of(fit.rest, sizes)]
     carried_um = math.hypot(*(_carried_um(fit, term) for term in fit.terms if term.hypothesis.acts_by_temperature))
-    if carried_um and not (points.is_exact or points.evidence.is_sparse or late_term(fit)):
+    if carried_um and not (points.is_exact or points.evidence.is_sparse or has_dead_time(fit)):
         more = dataclasses.replace(rests[0], own_um=math.hypot(rests[0].own_um, carried_um))
         rests = [more] if points.foretells else [*rests, more]
     learned = [learned_rest(points, fit.columns, fit.fixed, rest) for rest in rests]

@@ -12,6 +12,31 @@ BASE, EXTENDED = "base model", "extended model"
 SEARCHED, HELD_OUT = "searched", "held out"
 
 
+#: An adequate model that errs about the zero by more than this many times what it leaves where zero and initial state
+#: are fitted is right about changes only.
+_OFF_ZERO = 3.0
+
+
+def off_zero(found: Mapping[str, Any]) -> str:
+    """Return that an adequate model errs about the zero of its data, and why that may be; empty where it does not.
+
+    Examples
+    --------
+    >>> scores = {"base model": {"rms_um": 10.5, "rms_about_mean_um": 1.3}}
+    >>> run = {"name": "run.csv", "role": "searched", "scores": scores}
+    >>> off_zero({"verdict": "adequate", "before": {"rms_um": 1.2}, "free_run": [run]})[:40]
+    'About the zero it errs by 10.5 µm rms: t'
+    """
+    searched = [one["scores"][BASE]["rms_um"] for one in found.get("free_run", []) if one["role"] == SEARCHED]
+    far_um = max(searched, default=0.0)
+    if found["verdict"] != "adequate" or far_um <= _OFF_ZERO * found["before"]["rms_um"]:
+        return ""
+    return (
+        f"About the zero it errs by {far_um:.1f} µm rms: the machine was not at rest there, or the displacement sensor "
+        "moved in the first hours. Set the zero at rest, and look at the sensor's mount."
+    )
+
+
 def free_run_sentence(found: Mapping[str, Any]) -> str:
     """Return the errors in free run in a sentence: on held-out data where there are some; empty for an old file.
 

@@ -19,6 +19,7 @@ from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.change import BLOCK_MIN, changed_at
 from compensator.diagnose.deployment import SHORT_H
+from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.outcome import Diagnosis
 from compensator.model.effects.passing import Periodic
 
@@ -83,11 +84,16 @@ def explains_better(later: Diagnosis, all_data: Diagnosis) -> bool:
     if _is_of_measurement(later):
         # A period that has come once or twice looks like anything slow.
         is_period = any(isinstance(effect.effect, Periodic) for effect in later.effects)
-        if not is_period and any(effect.deployable for effect in all_data.effects):
+        if not is_period and any(all_data.deploys(effect) for effect in all_data.effects):
             left = _part(later, later.named.rms_um)
-    elif later.effects and all(effect.effect.deployable and effect.is_determined for effect in later.effects):
+    elif later.effects and all(_acts(effect) and effect.is_determined for effect in later.effects):
         left = left_part(later)
     return left < CLEARLY_BETTER * min(left_part(all_data), 1.0)
+
+
+def _acts(effect: FoundEffect) -> bool:
+    """Return whether an effect of the machine is deployed, or a remainder in its place."""
+    return effect.effect.deployable and not effect.left_in
 
 
 def _is_of_measurement(found: Diagnosis) -> bool:

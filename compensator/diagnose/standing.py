@@ -140,9 +140,12 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
             f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
         )
     if channels := held_by_the_base(found):
+        names = " and ".join(filter(None, (", ".join(channels[:-1]), channels[-1])))
+        in_part = f"What was found explains the error in part: {left}."
+        if fit["named_um"] >= fit["before_um"]:
+            in_part = f"What was found explains the error of {fit['before_um']:.2f} µm rms in the fit not by itself."
         return (
-            f"What was found explains the error in part: {left}. Heat and ambient move {' and '.join(channels)}, too, "
-            "and the base model has what that does already: with its own error corrected, "
+            f"{in_part} What heat and ambient do by {names} the base model has already: with its own error corrected, "
             f"{fit['after_um']:.2f} is left."
         )
     return (

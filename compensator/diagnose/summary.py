@@ -16,7 +16,7 @@ from compensator.diagnose.ceiling import ceiling, explained, falls_short, lowers
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import free_run_sentence
+from compensator.diagnose.free_run import free_run_sentence, off_zero
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder, rms_of
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.standing import words as of_the_effects
@@ -231,9 +231,10 @@ def _since(found: Mapping[str, Any]) -> str:
 def _residual(found: Mapping[str, Any]) -> str:
     """Return the verdict where no effect was found, with the residual."""
     hidden = "".join(f" {line}" for line in hiding_lines(found)[:1])
+    about_zero = f" {said}" if (said := off_zero(found)) else ""
     return (
-        f"{_words(found)} Residual {found['before']['rms_um']:.2f} µm rms{_with_remainder(found)}, sensor noise "
-        f"{found['noise_floor_um']:.2f}.{hidden}"
+        f"{_words(found)}{about_zero} Residual {found['before']['rms_um']:.2f} µm rms{_with_remainder(found)}, sensor "
+        f"noise {found['noise_floor_um']:.2f}.{hidden}"
     )
 
 

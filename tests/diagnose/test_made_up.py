@@ -147,7 +147,7 @@ def called_late() -> Findings:
 def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(called_late: Findings) -> None:
     before_um, after_um = in_free_run(called_late)
     assert called_late.explains and after_um > before_um
-    instead = by_channels(called_late, helps_nothing=False)
+    instead = by_channels(called_late, names_are_useless=False)
     assert instead is not None and not instead.explains and instead.terms == called_late.terms
     assert in_free_run(instead)[1] < 0.5 * before_um
 
@@ -156,8 +156,13 @@ def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(cal
     ("channels_um", "named_um", "is_confirmed"), [(0.7, 2.0, True), (0.8, 2.0, False), (0.7, 0.6, False)]
 )
 def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
-    called_late: Findings, channels_um: float, named_um: float, is_confirmed: bool
+    called_late: Findings,
+    channels_um: float,
+    named_um: float,
+    is_confirmed: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(deployment, "SHORT_H", 5.0)
     ones = np.ones(called_late.ceiling.size)
     named = named_um * ones
     held_out = held_out_errors(ones, named=named, whole=named, ceiling=channels_um * ones)
@@ -175,6 +180,7 @@ def test_all_channels_take_the_place_of_a_late_t_q_where_they_gain_far_more(
     called_late: Findings, channels_um: float, is_confirmed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What its correction gains in time, speed and load may gain before T_Q moves."""
+    monkeypatch.setattr(deployment, "SHORT_H", 5.0)
     monkeypatch.setattr(deployment, "in_free_run", lambda _: (1.0, 0.7))
     ones = np.ones(called_late.ceiling.size)
     held_out = held_out_errors(ones, named=0.6 * ones, whole=0.6 * ones, ceiling=channels_um * ones)
@@ -188,12 +194,18 @@ def test_all_channels_take_the_place_of_names_that_held_out_data_refute(
     """Where a cause acts in each block for the first time, held-out data refute everything: free run decides."""
     monkeypatch.setattr(deployment, "SHOWS_HIDDEN", limit)
     monkeypatch.setattr(deployment, "DAY_H", 5.0)
+    monkeypatch.setattr(deployment, "SHORT_H", 5.0)
     ones = np.ones(called_late.ceiling.size)
     held_out = held_out_errors(ones, named=3.0 * ones, whole=3.0 * ones, ceiling=2.0 * ones)
     decided = _decided(called_late, (), held_out)
     assert decided.contradicted and decided.is_refused
     instead = _by_channels(decided)
-    assert (instead is not None) is is_shown and not (instead and instead.contradicted)
+    assert (instead is not None) is is_shown
+    if instead:
+        assert not instead.is_refused and not instead.found.explains
+        # What is refused itself takes no place.
+        monkeypatch.setattr(deployment, "SHORT_H", 8.0)
+        assert _by_channels(decided) is None
 
 
 def test_a_name_that_no_part_of_a_record_shows_is_deployed_and_not_called_confirmed() -> None:

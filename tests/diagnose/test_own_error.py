@@ -11,7 +11,7 @@ from compensator.diagnose import diagnosis
 from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms, settled
+from compensator.diagnose.fit import fit_terms, response, settled
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.own_error import foretelling, own_error
 from compensator.diagnose.points import Points
@@ -107,7 +107,26 @@ def test_a_temperature_that_heat_moves_too_acts_by_what_the_base_does_not_have()
     fresh, true = warmed_bed(32)
     before, after = (np.std(true - tc.simulate(model, fresh)["y_pred_um"]) for model in (BASE, why.model))
     assert after < 0.04 * before
-    assert "Heat and ambient move bed_degc, too, and the base model has what that does already" in why.summary()
+    assert "What heat and ambient do by bed_degc the base model has already" in why.summary()
+
+
+def test_where_a_fit_is_to_foretell_the_own_error_is_as_large_as_what_heat_makes_of_a_temperature():
+    columns, _ = warmed_bed(22)
+    evidence = evidence_of(BASE, runs_from({name: values for name, values in columns.items() if name != "t_s"}))
+    points, by_channel = Points(evidence), {}
+    for hypothesis in Search(evidence).hypotheses:
+        if hypothesis.form == "lag":
+            by_channel[hypothesis.effect.channel] = hypothesis
+
+    def own_um(channel):
+        fit = fit_terms(Likelihood(points, points.typical_rest()), [(by_channel[channel], (20.0,))])
+        added = np.std(response(evidence, fit.terms[0]))
+        return foretelling(fit).rest.own_um, added
+
+    own, added = own_um("bed_degc")
+    assert 0.3 * added < own < 1.1 * added
+    own, added = own_um("spindle_rpm")
+    assert own < 1.1 * points.own_um
 
 
 def test_few_values_grant_no_own_error_that_is_not_deployed():

@@ -84,6 +84,17 @@ def test_an_effect_that_cannot_be_deployed_is_no_pass() -> None:
     assert tone_of(table) == "warn" and "none of them can be deployed" in headline(table)
 
 
+@pytest.mark.parametrize(("about_zero", "is_said"), [(10.5, True), (3.0, False)])
+def test_an_adequate_model_that_errs_about_the_zero_says_so(about_zero: float, is_said: bool) -> None:
+    """A sensor that settles in the first hours, and a warm start, are taken in by zero and initial state."""
+    scores = {"base model": {"rms_um": about_zero, "rms_about_mean_um": 1.3}}
+    scores["no compensation"] = {"rms_um": 57.6, "rms_about_mean_um": 35.3}
+    run = {"name": "run.csv", "role": "searched", "scores": scores}
+    table = found(verdict="adequate", effects=[], before={"rms_um": 1.2}, free_run=[run])
+    assert ("About the zero it errs by 10.5 µm rms" in headline(table)) is is_said
+    assert "About the zero" not in headline(table | {"verdict": "unexplained"})
+
+
 def test_an_effect_below_its_standard_error_is_undecided() -> None:
     rival = {"how_to_tell_apart": "Step it (expected change of the log evidence 13; 5 decides)."}
     table = found(verdict="partly_explained", rivals=[rival])
@@ -111,7 +122,11 @@ def test_where_the_remainder_does_the_work_it_is_said() -> None:
     assert "it is 50 % of the base model's own error" in remainder(table)[0].text()
     coolant = table["effects"][0] | {"kind": "input", "path": None, "channel": "coolant_degc"}
     together = table | {"effects": [coolant]}
-    assert "Heat and ambient move coolant_degc, too" in headline(together) and "0.16 is left." in headline(together)
+    words = headline(together)
+    assert "2.28 is left by it. What heat and ambient do by coolant_degc the base model has already" in words
+    assert "with its own error corrected, 0.16 is left." in words
+    alone = together | {"fit": fit | {"named_um": 6.0}}
+    assert "What was found explains the error of 5.62 µm rms in the fit not by itself." in headline(alone)
     best = {"rms_um": 1.0, "explained_pct": 0.0}
     assert explained(together | {"before": {"rms_um": 5.0}, "ceiling": best}).endswith("base model's own error.")
     other = found(verdict="partly_explained", remainder=rest | {"instead": True}, fit=fit)
