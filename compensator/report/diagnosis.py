@@ -10,6 +10,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.free_run import off_zero
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.standing import is_contradicted, is_in_the_model
 from compensator.diagnose.summary import (
@@ -51,8 +52,8 @@ TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_expla
 def tone_of(found: Mapping[str, Any]) -> Tone:
     """Return the tone of a diagnosis: that of its verdict.
 
-    No good one where the named effects fall short, where a run that took no part says otherwise, or where none of them
-    can be deployed.
+    No good one where the named effects fall short, where a run that took no part says otherwise, where none of them can
+    be deployed, or where an adequate model errs about the zero.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def tone_of(found: Mapping[str, Any]) -> Tone:
         Content of `diagnosis.json`.
     """
     tone = TONES[found["verdict"]]
-    if is_contradicted(found):
+    if is_contradicted(found) or off_zero(found):
         return "warn"
     holds = not found["effects"] or (is_in_the_model(found) and not falls_short(found))
     return tone if holds else "warn"

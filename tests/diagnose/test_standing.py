@@ -92,6 +92,7 @@ def test_an_adequate_model_that_errs_about_the_zero_says_so(about_zero: float, i
     run = {"name": "run.csv", "role": "searched", "scores": scores}
     table = found(verdict="adequate", effects=[], before={"rms_um": 1.2}, free_run=[run])
     assert ("About the zero it errs by 10.5 µm rms" in headline(table)) is is_said
+    assert (tone_of(table) == "warn") is is_said
     assert "About the zero" not in headline(table | {"verdict": "unexplained"})
 
 
