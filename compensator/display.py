@@ -200,6 +200,18 @@ def sentence_of(remark: Remark) -> Cell:
     return (str(remark), " ", CodeLink(remark.code))
 
 
+def listed(words: Sequence[str]) -> str:
+    """Return words in a row.
+
+    Examples
+    --------
+    >>> listed(["X", "Y", "Z"])
+    'X, Y and Z'
+    """
+    *first, last = words or [""]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def _is_numeric(cells: Sequence[str]) -> bool:
     return 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) >= len(cells)
 

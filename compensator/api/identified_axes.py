@@ -14,7 +14,7 @@ from compensator.api.axis_results import AxisModels
 from compensator.api.identification_result import IdentificationResult
 from compensator.axes import label_of
 from compensator.codes import Remark
-from compensator.display import Listing, Table, Words, warnings_of, with_std
+from compensator.display import Listing, Table, Words, listed, warnings_of, with_std
 from compensator.identify.pairs import Pair
 from compensator.identify.summary import MODEL, estimates
 from compensator.model.free_run import NOTHING
@@ -105,7 +105,7 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
         return f"{'; '.join(words)}. Errors on held-out blocks of time, rms: {errors}."
 
     def _times(self, axis: str) -> str:
-        return _listed([f"{float(f'{tau:.3g}'):g}" for tau in self.results[axis].calibration.deformation.main.taus_min])
+        return listed([f"{float(f'{tau:.3g}'):g}" for tau in self.results[axis].calibration.deformation.main.taus_min])
 
     def table(self) -> Table:
         """Return gains, time constants and errors, with a column for each axis."""
@@ -159,12 +159,7 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
 
 def _names(axes: Sequence[str] | Mapping[str, Any]) -> str:
     """Return axes by name, such as "X, Y and Z"."""
-    return _listed([label_of(axis) for axis in axes])
-
-
-def _listed(words: Sequence[str]) -> str:
-    *first, last = words or [""]
-    return f"{', '.join(first)} and {last}" if first else last
+    return listed([label_of(axis) for axis in axes])
 
 
 def _worst(result: IdentificationResult, name: str) -> str:

@@ -199,15 +199,14 @@ def _by_channels(decided: Deployment) -> Deployment | None:
 def _is_confirmed(instead: Findings, decided: Deployment, *, names_are_useless: bool) -> bool:
     """Return whether all channels, in the place of what was found, are confirmed clearly."""
     found, held_out = decided.found, decided.held_out
+    base_um, own_um = in_free_run(found)
     if names_are_useless:
-        base_um, own_um = in_free_run(found)
         is_shown = in_free_run(instead)[1] < SHOWS_HIDDEN * (base_um if decided.is_refused else min(base_um, own_um))
         if _hours(found) >= DAY_H or not is_shown:
             return is_shown
     whole_um, nothing_um = rms_of(held_out.whole), rms_of(held_out.nothing)
     lowers = LOWERS_CLEARLY if instead.terms else LOWERS_BY_FAR
-    base_um, own_um = in_free_run(found)
-    if late_term(found.selection.fit) is not None and found.left_in is None and own_um <= base_um:
+    if found.corrects_late_t_q and own_um <= base_um:
         # Its correction gains something, and what the channels gain before it must be more by far.
         whole_um *= LOWERS_CLEARLY
     # What is not known, in a record without a block to hold out, confirms nothing.
@@ -258,6 +257,6 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
     """
     base_um, own_um = in_free_run(found)
-    is_late = found.explains and found.left_in is None and late_term(found.selection.fit) is not None
+    is_late = found.explains and found.corrects_late_t_q
     is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else WORSE) * base_um
     return (base_um, own_um) if is_worse else None

@@ -117,6 +117,11 @@ class Findings:
         return bool(self.terms) and not any(term.effect.observed for term in self.terms)
 
     @property
+    def corrects_late_t_q(self) -> bool:
+        """Whether a late T_Q is named and not left in."""
+        return self.left_in is None and late_term(self.selection.fit) is not None
+
+    @property
     def is_own_error_alone(self) -> bool:
         """Whether the own error is deployed without effects beside it."""
         return self.belongs and not (self.terms and self.explains)
@@ -226,7 +231,7 @@ def by_channels(found: Findings, *, names_are_useless: bool) -> Findings | None:
     evidence = found.search.evidence
     if not found.terms:
         stays = found.remainder is not None
-    elif names_are_useless or (late_term(found.selection.fit) is not None and found.left_in is None):
+    elif names_are_useless or found.corrects_late_t_q:
         stays = False
     else:
         known = _log_evidence(found.selection.before)

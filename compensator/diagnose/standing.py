@@ -11,6 +11,7 @@ from typing import Any
 
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
 from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.display import listed
 from compensator.model.effects.hypothesis import DEGC
 from compensator.model.effects.input import Input
 from compensator.model.effects.unobserved import Unobserved
@@ -140,13 +141,12 @@ def _by_the_remainder(found: Mapping[str, Any]) -> str:
             f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."
         )
     if channels := held_by_the_base(found):
-        names = " and ".join(filter(None, (", ".join(channels[:-1]), channels[-1])))
         in_part = f"What was found explains the error in part: {left}."
         if fit["named_um"] >= fit["before_um"]:
             in_part = f"What was found explains the error of {fit['before_um']:.2f} µm rms in the fit not by itself."
         return (
-            f"{in_part} What heat and ambient do by {names} the base model has already: with its own error corrected, "
-            f"{fit['after_um']:.2f} is left."
+            f"{in_part} What heat and ambient do by {listed(channels)} the base model has already: with its own error "
+            f"corrected, {fit['after_um']:.2f} is left."
         )
     return (
         f"What was found explains the error in part: {left}. The remainder, which explains nothing, corrects that to "
