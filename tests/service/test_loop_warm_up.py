@@ -12,7 +12,7 @@ from compensator.service.compensation import Compensation
 from compensator.service.loop.core import is_rest, warmed_on
 from compensator.service.loop.shadow import Shadow
 from compensator.service.outcome import Outcome
-from tests.service.looping import extended, machine, settings
+from tests.service.looping import extended, machine, settings, stronger
 
 RECORD = 3000
 
@@ -91,3 +91,25 @@ def test_what_a_person_has_seen_to_before_the_candidate_is_no_fault_of_it() -> N
     # While the present one waits for a person, the candidate does, too.
     early = Shadow(warmed_on(guarded, parse_model(extended(3.0), source="candidate"), record[:610]), b"")
     assert Reason.T_Q_AT_EXCHANGED in early.process(record[610])[1].offset.reasons
+    # What was fed with exchanged couples is unknown under both.
+    assert not present.status.is_known and not shadow.compensation.status.is_known
+
+
+def test_wires_that_measured_y_has_shown_to_be_right_are_so_for_every_model() -> None:
+    """The present model's state is believed from there on, and so is a candidate's whose own Y does not show it."""
+    checks = {"t_q_below_at_after_min": 30.0, "false_alarm_days": 30.0, "residual_std_um": 2.0}
+    guarded = settings(plausibility=checks, guards={"t_q_below_at_max_k": 2.0, "suspect_jumps": True})
+
+    def exchanged(i: int, values: dict[str, float]) -> None:
+        if 400 <= i < 600:
+            values["t_q_degc"], values["at_degc"] = values["at_degc"], values["t_q_degc"]
+
+    present = Compensation(guarded, parse_model(extended(3.0), source="present"))
+    shadow = Shadow(Compensation(guarded, parse_model(stronger(1.0), source="candidate")), b"")
+    latched = list[tuple[bool, bool]]()
+    for one in machine(1200, change=exchanged):
+        outcome = present.process(one)
+        shadow.process(outcome)
+        latched.append((present.plausibility.exchanged, shadow.compensation.plausibility.exchanged))
+    assert any(own and other for own, other in latched) and not any(latched[-1])
+    assert present.status.is_known and shadow.compensation.status.is_known

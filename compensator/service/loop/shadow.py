@@ -64,8 +64,12 @@ class Shadow:
         self.compensation.receive_probes([probe for probe in received if probe is not None])
         other = self.compensation.process(outcome.sample)
         if self.compensation.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in outcome.offset.reasons:
-            # A person has seen to the couples: a warm-up passes samples, zeros and probes, and no commands.
-            self.compensation.resume()
+            # Wires that are right again are so for every model. A warm-up passes samples, zeros and probes, and no
+            # commands: where the present state is unknown a person has seen to them; else measured Y has shown it.
+            if Reason.COLD_START in outcome.offset.reasons:
+                self.compensation.resume()
+            else:
+                self.compensation.plausibility.acknowledge()
         return msgspec.structs.replace(outcome, probes=probes), other
 
 
