@@ -5,8 +5,8 @@ its channel from the zero, when the effect did not act. Measured Y shows it if n
 time the present model was right about this zero, and about changes more so than the candidate: the effect did not act
 yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. While the two are
 compared what the candidate leaves neither grows nor shrinks, as it would with a mount that creeps; before that the
-effect may still have grown to its full size. And it is no larger than what the candidate moves: a small effect is not
-the cause of a large level.
+effect may still have grown to its full size. And it is no larger than twice what the candidate moves: a small effect
+is not the cause of a large level, but at the zero its channel may have been as far from where it has none as it moves.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ WAS_RIGHT, RIGHTER = 0.5, 0.8
 #: The candidate's residual stays if its first and second half differ by less than this part of the present one's error,
 #: and the median of its deviations is less than that part.
 STAYS, SPREAD = 0.25, 0.3
+#: The level is no larger than so many times the range by which the candidate moves.
+_MOST = 2.0
 #: Blocks that are remembered.
-_MOST = 144
+_BLOCKS = 144
 
 
 class ErrorBlocks(msgspec.Struct, kw_only=True):
@@ -59,7 +61,7 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
         residual_um, block = number(outcome.estimate.residual_um), outcome.sample.time_utc_ns // BLOCK_NS
         if block != self.number:
             if self.count:
-                self.blocks = [*self.blocks, (self.number, self.sum_um / self.count)][-_MOST:]
+                self.blocks = [*self.blocks, (self.number, self.sum_um / self.count)][-_BLOCKS:]
             self.number, self.count, self.sum_um = block, 0, 0.0
         if np.isfinite(residual_um) and not is_disturbed(outcome.offset.reasons):
             self.count, self.sum_um = self.count + 1, self.sum_um + residual_um
@@ -95,7 +97,7 @@ def level_um(
     True
     >>> level_um(began, [(n, 6.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
     True
-    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 6.0) for n in range(40)]) is None  # it moves Y by 3 µm only
+    >>> level_um(began, [(n, 0.8 * (n % 2) if n < 12 else 6.5) for n in range(40)]) is None  # it moves Y by 2 µm only
     True
     """
     others = dict(other)
@@ -117,7 +119,7 @@ def level_um(
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
     spread_um = float(np.median(np.abs(left_um - middle_um)))
     stays = abs(halves[1] - halves[0]) < STAYS * error_um and spread_um < SPREAD * error_um
-    moves = abs(middle_um) <= np.ptp(own - rest)
+    moves = abs(middle_um) <= _MOST * np.ptp(own - rest)
     return middle_um if was_right and stays and moves else None
 
 
