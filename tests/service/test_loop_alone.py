@@ -165,12 +165,18 @@ def test_what_was_compared_before_both_models_had_an_alarm_is_forgotten() -> Non
     assert loop.state.found[0].comparison.first_ns == 0 < loop.state.found[1].comparison.first_ns
 
 
-@pytest.mark.parametrize(("role", "expected"), [("before", "back"), ("candidate", "")])
-def test_a_dead_channel_of_the_model_in_force_does_not_block_the_way_back(role: Role, expected: str) -> None:
+@pytest.mark.parametrize(("role", "expected"), [("before", "back"), ("candidate", "adopt")])
+def test_a_dead_channel_of_the_model_in_force_does_not_block_another_one(role: Role, expected: str) -> None:
     other = place("b", role)
     loop = loop_of(watched=other) if role == "before" else loop_of(other)
     steps = [one.step for one in decided(loop, 30, lambda _: DEAD, {"b": never}) if one.step != "diagnose"]
-    assert steps == ([expected] if expected else [])
+    assert steps == [expected]
+
+
+def test_an_unknown_state_is_diagnosed_and_judges_nothing() -> None:
+    """After a stop over the weekend it lasts for days; a diagnosis starts from a state of its own."""
+    cold = decided(loop_of(place("b")), 30, lambda _: ("cold_start",), {"b": lambda _: ("cold_start",)})
+    assert {one.step for one in cold} == {"diagnose"}
 
 
 @pytest.mark.parametrize("role", ["before", "candidate"])

@@ -126,6 +126,15 @@ def test_what_promises_least_by_the_hour_gives_way_and_nothing_by_noise(others: 
     assert ended.data["why"] == "gives_way" and ended.data["model_sha256"][0] == gives_way
 
 
+def test_what_is_never_compared_keeps_no_place() -> None:
+    """A candidate whose channel is dead, or whose state is not known, for twice the time that judges one."""
+    dead = place("a", None, hours=0.0)
+    dead.since_utc_ns = NOW_NS - 12 * HOUR_NS
+    loop = full(dead, place("b", 0.5), place("c", 3.9))
+    loop.receive(found(["gain:DTF"]), NOW_NS)
+    assert loop.begin()[0].data["model_sha256"][0] == "a"
+
+
 class Stands:
     """Stands for what is compared of a candidate that is better than the present model."""
 

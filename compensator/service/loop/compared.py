@@ -76,8 +76,7 @@ class Compared:
             found.set_zero()
         reasons = [*present.offset.reasons, *other.offset.reasons]
         # A channel that only the model in force needs is no reason to stay with it.
-        needed = other.offset.reasons if self._place.role == "before" else reasons
-        missing = any(reason.startswith(Reason.CHANNEL_MISSING) for reason in needed)
+        missing = any(reason.startswith(Reason.CHANNEL_MISSING) for reason in other.offset.reasons)
         if missing or is_unusable(present, other) or is_disturbed(reasons):
             return False
         if not found.add(present, other, suspected=False):

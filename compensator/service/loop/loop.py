@@ -48,7 +48,7 @@ from compensator.service.loop.trust import (
 from compensator.service.loop.words import begins, named, nothing_follows, surpassed, wait_over, waits
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.comparison import BLOCK_MIN
-from compensator.service.transfer.second_opinion import described, is_unusable
+from compensator.service.transfer.second_opinion import described
 
 #: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
 #: and a candidate ends that has been at a limit for so long, min.
@@ -263,7 +263,7 @@ class Loop:
         if before is not None and is_asked(before, self._settings):
             state.diagnosis = None
             return [nothing_follows("in_shadow", found)]
-        last = gives_way(state, self._settings) if before is None else None
+        last = gives_way(state, self._settings, running.to_utc_ns) if before is None else None
         notes = end(self.state, last, "gives_way") if last is not None else []
         if before is not None and before.is_proposed:
             text = "newer parameters of the same effects take over, and are proposed once their own hours show it"
@@ -378,11 +378,12 @@ def _counted(before_min: float, present: Outcome, minutes: float, *, suspected: 
     """Return the time without a suspicion up to `CLEAN_MIN`, min.
 
     A lost sample takes back what a good one gives: where a line loses one reading in twenty, there are hardly ever
-    thirty minutes without a loss, while a couple that is broken for so long leaves nothing.
+    thirty minutes without a loss, while a couple that is broken for so long leaves nothing. A state that is not known
+    is no fault of a sensor: nothing is compared then, but a diagnosis starts from a state of its own.
     """
     reasons, before_min = present.offset.reasons, min(before_min, CLEAN_MIN)
     if not suspected and is_lost(reasons):
         return max(before_min - minutes, 0.0)
-    if suspected or is_disturbed(reasons) or is_unusable(present):
+    if suspected or is_disturbed(reasons):
         return 0.0
     return min(before_min + minutes, CLEAN_MIN)

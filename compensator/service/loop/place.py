@@ -27,6 +27,8 @@ DIFFERS = 1.0
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: Newer parameters of its effects take the place of a candidate after so many times `shadow_h`: not all hours count.
 _YOUNG = 1.25
+#: A candidate has had the time to be judged after so many times `shadow_h`.
+_HAS_TIME = 2.0
 _HOUR_NS = 3600 * NS
 
 
@@ -69,17 +71,22 @@ def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place 
     return alike[0] if alike and role == "candidate" and not state.exchange else None
 
 
-def gives_way(state: LoopState, settings: LoopSettings) -> Place | None:
+def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | None:
     """Return the model that gives its place to a newcomer with other effects; None if a place is free.
 
     It is the one with the least log likelihood ratio for each hour of evidence (`Place.promise`), of those that have
-    been judged for `shadow_h`: before that it is noise. Only where none has, of all. What is proposed stays.
+    been judged for `shadow_h`, where it is noise before, or have had the time for that: what is never compared keeps no
+    place. Only where none has, of all. What is proposed stays.
     """
     if len(state.found) < CANDIDATES:
         return None
+
+    def is_new(place: Place) -> bool:
+        has_time = now_ns - place.since_utc_ns >= _HAS_TIME * settings.shadow_h * _HOUR_NS
+        return place.verdict.hours < settings.shadow_h and not has_time
+
     return min(
-        (place for place in state.found if not place.is_proposed),
-        key=lambda place: (place.verdict.hours < settings.shadow_h, place.promise),
+        (place for place in state.found if not place.is_proposed), key=lambda place: (is_new(place), place.promise)
     )
 
 
