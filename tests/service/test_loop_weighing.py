@@ -37,6 +37,21 @@ def test_the_own_error_beside_a_named_effect_makes_no_other_explanation_of_it() 
     assert difference(extended(coolant(2.0)), first) == (True, 0.0)
 
 
+def test_parameters_of_two_time_constants_are_compared_one_by_one() -> None:
+    """`std` names them for people (`gain_1_um_per_k`), and the table has lists."""
+    table = {"channel": "coolant_degc", "curve": "linear", "tau_min": [3.0, 40.0], "delay_min": 0.0}
+    factor = [
+        [1.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 12.0, 0.0, 0.0, 0.0],
+        [0.0, 5.0, 0.3, 0.0, 0.0],
+        [0.0, 0.0, 0.4, 0.1, 0.0],
+    ]
+    found = {"std": {"gain_1_um_per_k": 0.5, "delay_min": 1.0}, "std_factor": factor}
+    first, again = (extended(("input", {**table, "gain": [gain, 0.3], **found})) for gain in (0.5, 1.5))
+    same, deviations = difference(again, first)
+    assert same and math.isclose(deviations, 2.0)
+
+
 def test_a_remainder_alone_is_told_by_its_channels() -> None:
     first, again = extended(remainder("heat_w", "floor_degc")), extended(remainder("heat_w", "coolant_degc"))
     assert effect_names(first) == ["regression:heat_w+floor_degc"]

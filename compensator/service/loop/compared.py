@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from compensator.clock import NS
@@ -190,6 +191,17 @@ class Compared:
     def unknown_level_um(self) -> float:
         """By how much it is raised where its level is not known, µm: only its changes are new."""
         return self._comparison.level_um if self._place.verdict.y_moved else 0.0
+
+    @property
+    def level_at_return_um(self) -> float:
+        """By how much a model that the service goes back to is raised, µm.
+
+        Its level is that of the zero, as if the other one had never been adopted: it is raised to the present level
+        only where that is clearly nearer to measured Y, too.
+        """
+        residuals_um, raised_um = self._comparison.residuals_um, self.unknown_level_um
+        own, raised = (math.hypot(*(other - by_um for _, _, other in residuals_um)) for by_um in (0.0, raised_um))
+        return raised_um if raised <= LEVEL_PART * own else 0.0
 
     @property
     def level_at_adoption_um(self) -> float:

@@ -17,13 +17,13 @@ from compensator.service.loop.state import Exchange, LoopState, Place
 def decide_exchange(
     state: LoopState, action: Exchange, place: Place, compared: Callable[[Place], Compared]
 ) -> list[Note]:
-    """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
+    """Decide an exchange, and the level of the other model."""
     found, proposed = compared(place), state.proposed
     notes = []
     if proposed is not None and proposed is not place:
         notes = withdraw(state, proposed, "another model replaces the present one")
     state.exchange, state.incoming = action, place.sha256
-    state.level_um = found.level_at_adoption_um if action == "adopt" else found.unknown_level_um
+    state.level_um = found.level_at_adoption_um if action == "adopt" else found.level_at_return_um
     if action == "adopt" and found.shown_level_um is not None:
         place.verdict = msgspec.structs.replace(place.verdict, y_moved=False)  # the effect has moved it
     return notes

@@ -32,6 +32,8 @@ WAS_RIGHT, RIGHTER = 0.5, 0.8
 STAYS, SPREAD = 0.25, 0.3
 #: The level is no larger than so many times the range by which the candidate moves.
 _MOST = 2.0
+#: Blocks after which what a model leaves counts as a constant.
+_CONSTANT = 12
 #: Blocks that are remembered.
 _BLOCKS = 144
 
@@ -69,6 +71,18 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
     def clear(self) -> None:
         """Begin anew: at a zero, or with another model."""
         self.blocks, self.count, self.sum_um = [], 0, 0.0
+
+
+def is_constant(blocks: Sequence[tuple[int, float]]) -> bool:
+    """Return whether a model has left nothing but a constant for hours: Y was shifted, and moves as it predicts.
+
+    Examples
+    --------
+    >>> is_constant([(n, 5.0 + 0.2 * (n % 3)) for n in range(12)]), is_constant([(n, 0.4 * n) for n in range(12)])
+    (True, False)
+    """
+    last = [mean for _, mean in blocks[-_CONSTANT:]]
+    return len(last) == _CONSTANT and max(last) - min(last) <= SPREAD * abs(sum(last)) / _CONSTANT
 
 
 def level_um(

@@ -23,7 +23,7 @@ from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
-from compensator.service.loop.level import ErrorBlocks
+from compensator.service.loop.level import ErrorBlocks, is_constant
 from compensator.service.loop.misfit import count_misfit
 from compensator.service.loop.place import (
     falls,
@@ -122,7 +122,9 @@ class Loop:
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
         minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
         forget_future(state, now_ns)
-        suspected = contradicted or (bool(others) and all_suspect_a_sensor([present, *others.values()]))
+        shifted = {place.sha256 for place in state.taken if is_constant(place.error.blocks)}
+        all_suspect = bool(others) and not shifted and all_suspect_a_sensor([present, *others.values()])
+        suspected = contradicted or all_suspect
         state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
         record_ns = round(self._settings.record_h * _HOUR_NS)
@@ -136,8 +138,10 @@ class Loop:
             compared, other = self.compared(place), others[place.sha256]
             beyond = is_limited(other) and not is_limited(present)
             place.limited_min = place.limited_min + minutes if beyond else 0.0
-            # A newcomer that no sensor speaks against says nothing of two older models that both suspect one.
-            if not (contradicted or all_suspect_a_sensor([present, other])):
+            # A newcomer that no sensor speaks against says nothing of two older models that both suspect one. Where a
+            # model leaves a constant for hours, Y was shifted: its changes are judged, and no sensor falsifies them.
+            is_suspected = place.sha256 not in shifted and all_suspect_a_sensor([present, other])
+            if not (contradicted or is_suspected):
                 judged += [place] if compared.add(present, other) else []
             elif compared.add_suspected(other, suspicions(present, other)) and place.is_proposed and not state.exchange:
                 notes += withdraw(self.state, place, "a sensor is suspected, so what was compared does not count")
