@@ -103,6 +103,18 @@ def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level(
     assert "adopt" in [step for _, step, _ in decisions(steps)]
 
 
+@pytest.mark.parametrize(
+    ("verdict", "every_h", "is_adopted"),
+    [("explained", 12, True), ("explained", 24, False), ("partly_explained", 12, False)],
+)
+def test_what_explains_most_of_a_record_without_a_drift_refutes_it(verdict, every_h, is_adopted):
+    """The beginning of an effect was called a drift; half a day later most of that record is explained without one."""
+    drifted, later = dataclasses.replace(shown(extended()), y_drifted=True), shown(extended(2.9), verdict)
+    loop = LoopRun(settings(loop={"every_h": every_h}), QUILL_FILE, Night(drifted, *[later] * 9))
+    steps = run(loop, machine(3 * DAY), 2 * DAY)
+    assert ("adopt" in [step for _, step, _ in decisions(steps)]) == is_adopted
+
+
 def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):
     wrong = 1600
     monkeypatch.setattr(loop_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)

@@ -36,7 +36,7 @@ from compensator.service.loop.place import (
 from compensator.service.loop.proof import is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place
+from compensator.service.loop.state import LoopState, Place, Running
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -100,7 +100,8 @@ class Loop:
         """Return what is compared of a model in shadow and the present one."""
         state = self.state
         count = max(len(state.candidates), 1)
-        return Compared(place, self._settings, self._period_s, state.error, candidates=count, y_drifted=state.y_drifted)
+        has_drifted = state.y_drifted_ns > 0
+        return Compared(place, self._settings, self._period_s, state.error, candidates=count, y_drifted=has_drifted)
 
     # ------------------------------------------------------------------ one sample
 
@@ -130,7 +131,7 @@ class Loop:
         record_ns = round(self._settings.record_h * _HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         state.error.update(present)
-        state.y_drifted = state.y_drifted and not sets_zero(present)
+        state.y_drifted_ns = 0 if sets_zero(present) else state.y_drifted_ns
         notes = self._forget_wrong() if was_wrong(present) else []
         notes += self._wait(present, others, is_suspected=suspected)
         judged: list[Place] = []
@@ -248,11 +249,22 @@ class Loop:
         if running is None or running.candidate_sha256:
             return []  # what another one has found is warmed up, or begins
         state.diagnosis = None
-        state.y_drifted = state.y_drifted or found.y_drifted
+        self._judge_y(found, running)
         why = why_nothing(state, self._settings, found, now_ns)
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
         return [nothing_follows(why, found)] if why else []
+
+    def _judge_y(self, found: DiagnosisData, running: Running) -> None:
+        """Remember that measured Y has moved by itself, until what explains most of that record finds it has not.
+
+        Where an effect begins in a record, it may look like a step or a drift of Y until there is more of it.
+        """
+        half_ns = round(0.5 * self._settings.record_h * _HOUR_NS)
+        if found.y_drifted:
+            self.state.y_drifted_ns = running.to_utc_ns
+        elif found.verdict == "explained" and running.from_utc_ns <= self.state.y_drifted_ns - half_ns:
+            self.state.y_drifted_ns = 0
 
     def begin(self) -> list[Note]:
         """Say that what is warmed up gets a place before the next sample, and what gives its own for it; or nothing.
