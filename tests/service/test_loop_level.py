@@ -8,21 +8,23 @@ import asyncio
 import dataclasses
 import json
 
+import msgspec
 import numpy as np
 import pytest
 
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.config import Loop
+from compensator.events import ComparisonVerdict
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
 from compensator.service.loop import loop as loop_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import LoopRun
-from compensator.service.loop.state import Place
+from compensator.service.loop.state import NO_VERDICT, Place
 from compensator.service.replay import opening_of
-from compensator.service.transfer.comparison import BLOCK_NS
+from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, crept, decisions, errors, extended, machine, run, settings, shown
@@ -101,6 +103,16 @@ def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level(
     loop.compensation.zero("warm")
     steps += run(loop, samples, DAY)
     assert "adopt" in [step for _, step, _ in decisions(steps)]
+
+
+@pytest.mark.parametrize(("own_um", "other_um", "raised_um"), [(5.0, -5.2, 0.0), (4.0, 9.0, 5.0), (4.9, 5.1, 0.0)])
+def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clearly_nearer(own_um, other_um, raised_um):
+    blocks = [Block(0, n, 30, (0.0, 0.0), (own_um + 0.3 * (n % 2), other_um + 0.1 * (n % 2), 0.0)) for n in range(20)]
+    verdict = msgspec.structs.replace(NO_VERDICT, verdict=ComparisonVerdict.BETTER, y_moved=True)
+    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1, verdict=verdict)
+    place.comparison = ComparisonState(blocks=blocks)
+    found = Compared(place, settings().loop, 60.0, ErrorBlocks())
+    assert found.level_at_return_um == pytest.approx(raised_um, abs=0.2)
 
 
 @pytest.mark.parametrize(
