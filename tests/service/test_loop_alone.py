@@ -52,13 +52,18 @@ class Decided:
     why: str
 
 
-def decided(loop: Loop, hours: float, present: Reasons, others: dict[str, Reasons]) -> Iterator[Decided]:
-    """Run a loop, until it exchanges models; diagnoses find nothing. Others are named by their first letter."""
+def decided(
+    loop: Loop, hours: float, present: Reasons, others: dict[str, Reasons], shift_um: float = 0.0
+) -> Iterator[Decided]:
+    """Run a loop, until it exchanges models; diagnoses find nothing. Others are named by their first letter.
+
+    The mount of the displacement sensor has shifted Y by `shift_um`.
+    """
     noise = np.random.default_rng(1)
     for minute in range(1, round(60 * hours)):
         effect_um = 5.0 * math.sin(minute / 90.0) + 3.0 * math.sin(minute / 37.0)
-        y_um = 30.0 * math.sin(minute / 70.0) + effect_um
-        own, other = noise.normal(0.0, 0.4, 2)
+        y_um = 30.0 * math.sin(minute / 70.0) + effect_um + shift_um
+        own, other = noise.normal(shift_um, 0.4, 2)
         known = {one.sha256: outcome(minute, other, y_um, others[one.sha256[0]](minute)) for one in loop.state.taken}
         for note in loop.step(outcome(minute, effect_um + own, y_um, present(minute)), known):
             yield Decided(minute / 60.0, note.data["step"], note.data.get("why", ""))
@@ -103,6 +108,13 @@ def test_a_newcomer_without_an_alarm_lets_no_older_models_judge_that_have_one() 
     assert [(one.step, one.why) for one in notes if one.step != "diagnose"] == [("adopt", "")]
     assert loop.state.incoming[0] == "n"
     assert loop.state.found[0].comparison.first_ns == 0 < loop.state.found[1].comparison.first_ns
+
+
+@pytest.mark.parametrize(("shift_um", "step"), [(6.0, "adopt"), (0.0, "wait")])
+def test_what_leaves_a_constant_is_compared_while_all_models_suspect_a_sensor(shift_um: float, step: str) -> None:
+    """A mount that has slipped alarms every model until the next zero; the changes of Y are right all the same."""
+    notes = decided(loop_of(place("a")), 24, after(0), {"a": after(0)}, shift_um)
+    assert [one.step for one in notes if one.step != "diagnose"] == [step]
 
 
 def waited(loop: Loop, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:
