@@ -52,6 +52,15 @@ def test_parameters_of_two_time_constants_are_compared_one_by_one() -> None:
     assert same and math.isclose(deviations, 2.0)
 
 
+def test_a_remainder_of_other_gains_is_another_model() -> None:
+    """Its gains are rows, and its factor has a column for each."""
+    kind, table = remainder("heat_w", "floor_degc")
+    factor = {"std_factor": [[0.1] * 4, [0.2] * 4]}
+    first, again = (extended((kind, {**table, "gains": [[gain, 0.2], [0.1, 0.2]], **factor})) for gain in (0.1, 0.5))
+    assert difference(again, first) == (True, math.inf)
+    assert difference(first, first) == (True, 0.0)
+
+
 def test_a_remainder_alone_is_told_by_its_channels() -> None:
     first, again = extended(remainder("heat_w", "floor_degc")), extended(remainder("heat_w", "coolant_degc"))
     assert effect_names(first) == ["regression:heat_w+floor_degc"]

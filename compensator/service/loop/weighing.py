@@ -162,11 +162,11 @@ def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
 
 def _change(effect: Effect, other: Effect) -> float:
     """Return by how many standard deviations the parameter of an effect that differs most does."""
-    if effect.std_factor and len(effect.parameters) == len(other.parameters):
+    factors = [math.hypot(*column) for column in zip(*effect.std_factor, strict=True)]
+    if factors and len(factors) == len(effect.parameters) == len(other.parameters):
         # `std` names what stands in lists one by one.
-        errors = [math.hypot(*column) for column in zip(*effect.std_factor, strict=True)]
         moved = [abs(a - b) for a, b in zip(effect.parameters, other.parameters, strict=True)]
-        return max((by / std for by, std in zip(moved, errors, strict=True) if std > 0.0), default=0.0)
+        return max((by / std for by, std in zip(moved, factors, strict=True) if std > 0.0), default=0.0)
     tables, largest, compared = (effect.to_table(), other.to_table()), 0.0, False
     for name in effect.std:
         values = [_numbers(table.get(name)) for table in tables]
