@@ -53,17 +53,23 @@ class Decided:
 
 
 def decided(
-    loop: Loop, hours: float, present: Reasons, others: dict[str, Reasons], shift_um: float = 0.0
+    loop: Loop,
+    hours: float,
+    present: Reasons,
+    others: dict[str, Reasons],
+    shift_um: float = 0.0,
+    other_level_um: float = 0.0,
 ) -> Iterator[Decided]:
     """Run a loop, until it exchanges models; diagnoses find nothing. Others are named by their first letter.
 
-    The mount of the displacement sensor has shifted Y by `shift_um`.
+    The mount of the displacement sensor has shifted Y by `shift_um`; the others are off by `other_level_um` more.
     """
     noise = np.random.default_rng(1)
     for minute in range(1, round(60 * hours)):
         effect_um = 5.0 * math.sin(minute / 90.0) + 3.0 * math.sin(minute / 37.0)
         y_um = 30.0 * math.sin(minute / 70.0) + effect_um + shift_um
         own, other = noise.normal(shift_um, 0.4, 2)
+        other += other_level_um
         known = {one.sha256: outcome(minute, other, y_um, others[one.sha256[0]](minute)) for one in loop.state.taken}
         for note in loop.step(outcome(minute, effect_um + own, y_um, present(minute)), known):
             yield Decided(minute / 60.0, note.data["step"], note.data.get("why", ""))
@@ -115,6 +121,13 @@ def test_what_leaves_a_constant_is_compared_while_all_models_suspect_a_sensor(sh
     """A mount that has slipped alarms every model until the next zero; the changes of Y are right all the same."""
     notes = decided(loop_of(place("a")), 24, after(0), {"a": after(0)}, shift_um)
     assert [one.step for one in notes if one.step != "diagnose"][-1] == step
+
+
+@pytest.mark.parametrize(("level_um", "steps"), [(0.0, ["back"]), (30.0, [])])
+def test_the_zero_speaks_against_a_way_back_that_only_changes_show(level_um: float, steps: list[str]) -> None:
+    """The model before moves as Y does, and its level is 30 µm off where the present one is wrong by 5."""
+    notes = decided(loop_of(watched=place("b", "before")), 24, never, {"b": never}, other_level_um=level_um)
+    assert [one.step for one in notes if one.step != "diagnose"] == steps
 
 
 def waited(loop: Loop, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:

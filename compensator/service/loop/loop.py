@@ -17,7 +17,7 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonVerdict, DiagnosisData, LoopAction, Note
+from compensator.events import DiagnosisData, LoopAction, Note
 from compensator.service.loop.avoided import avoid
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
@@ -33,7 +33,7 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.proof import is_limited
+from compensator.service.loop.proof import is_better_to_go_back_to, is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place, Running
@@ -183,7 +183,7 @@ class Loop:
 
     def _decide(self, place: Place, now_ns: int, *, is_judged: bool) -> list[Note]:
         """Decide about one model: whether it ends, a proposal falls, or the service goes back to it."""
-        is_candidate, verdict = place.role == "candidate", place.verdict.verdict
+        is_candidate = place.role == "candidate"
         if is_candidate and place.limited_min >= CLEAN_MIN:
             return end(self.state, place, "limits")
         if now_ns - place.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
@@ -192,7 +192,7 @@ class Loop:
         if self.state.clean_min < CLEAN_MIN or not is_judged:
             return []
         if not is_candidate:
-            return self._go_back(place) if verdict == ComparisonVerdict.BETTER else []
+            return self._go_back(place) if is_better_to_go_back_to(place.verdict) else []
         if self.compared(place).is_worse:
             return end(self.state, place, "worse")
         if place.is_proposed and falls(place.verdict, self._settings):

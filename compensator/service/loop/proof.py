@@ -17,6 +17,8 @@ LEVEL_PART = 0.8
 #: What diagnoses have found runs in so many places at once. The diagnoses of simulated weeks name two or three
 #: explanations by turns; each costs processor time, and what the others must show (`shared`).
 CANDIDATES = 3
+#: The service does not go back where the present model is wrong about the zero by less than this part.
+_BACK_PART = 0.5
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
@@ -57,6 +59,13 @@ def is_better_about_zero(found: ComparisonData, part: float = BETTER_PART) -> bo
     if found.present_rms_um is None or found.candidate_rms_um is None:
         return False
     return found.candidate_rms_um <= part * found.present_rms_um
+
+
+def is_better_to_go_back_to(found: ComparisonData) -> bool:
+    """Return whether a model before is better: by the changes, and the zero does not speak strongly against it."""
+    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.present_rms_um >= _BACK_PART * found.candidate_rms_um
 
 
 def is_limited(outcome: Outcome) -> bool:
