@@ -32,7 +32,7 @@ WAS_RIGHT, RIGHTER = 0.5, 0.8
 STAYS, SPREAD = 0.25, 0.3
 #: The level is no larger than so many times the range by which the candidate moves.
 _MOST = 2.0
-#: Blocks after which what a model leaves counts as a constant.
+#: Blocks that show a constant: they differ by no more than `SPREAD` of it.
 _CONSTANT = 12
 #: Blocks that are remembered.
 _BLOCKS = 144

@@ -123,9 +123,8 @@ class Loop:
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
         minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
         forget_future(state, now_ns)
-        shifted = {place.sha256 for place in state.taken if is_constant(place.error.blocks)}
-        all_suspect = bool(others) and not shifted and all_suspect_a_sensor([present, *others.values()])
-        suspected = contradicted or all_suspect
+        all_suspect = bool(others) and all_suspect_a_sensor([present, *others.values()])
+        suspected = contradicted or (all_suspect and not any(is_constant(place.error.blocks) for place in state.taken))
         state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
         record_ns = round(self._settings.record_h * _HOUR_NS)
@@ -141,7 +140,7 @@ class Loop:
             place.limited_min = place.limited_min + minutes if beyond else 0.0
             # A newcomer that no sensor speaks against says nothing of two older models that both suspect one. Where a
             # model leaves a constant for hours, Y was shifted: its changes are judged, and no sensor falsifies them.
-            is_suspected = place.sha256 not in shifted and all_suspect_a_sensor([present, other])
+            is_suspected = all_suspect_a_sensor([present, other]) and not is_constant(place.error.blocks)
             if not (contradicted or is_suspected):
                 judged += [place] if compared.add(present, other) else []
             elif compared.add_suspected(other, suspicions(present, other)) and place.is_proposed and not state.exchange:
