@@ -100,6 +100,18 @@ class Compensation(Continuity):
             if self._engine.has_reference:
                 self._pass_cold(self._cold_samples)
 
+    def believe_wires(self, reasons: Sequence[str]) -> None:
+        """Believe that T_Q and AT are right again where the model in force does, whose reasons of a sample are given.
+
+        Where its state was unknown then a person has seen to the wires; else measured Y has shown it, maybe not yet by
+        this model.
+        """
+        if self.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in reasons:
+            if Reason.COLD_START in reasons:
+                self.resume()
+            else:
+                self.plausibility.acknowledge()
+
     def _release(self, *, new_zero: bool) -> None:
         """Use channels again that have jumped."""
         found = self._jumps.release(self._engine, self._memory.estimate, new_zero=new_zero)

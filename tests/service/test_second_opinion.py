@@ -225,6 +225,22 @@ async def test_a_suspected_sensor_judges_no_model(tmp_path: Path) -> None:
     assert (found.verdict, found.why) == ("not_judged", "suspect") and "suspected a sensor" in described(found)
 
 
+async def test_temperatures_that_measured_y_has_shown_to_be_right_keep_no_model_unjudged(tmp_path: Path) -> None:
+    """T_Q fell below AT for hours. The model in force saw by its own Y that it was right again; a weak one never."""
+    checks = {"t_q_below_at_after_min": 30.0, "false_alarm_days": 30.0, "residual_std_um": 2.0}
+    guarded = settings(plausibility=checks, guards={"t_q_below_at_max_k": 2.0, "suspect_jumps": True})
+    machine = Measured(tmp_path, config=guarded)
+    t_q = machine.device.sources[0]
+    fallen_k = functools.partial(np.interp, xp=[400, 460, 600, 660], fp=[0.0, 40.0, 40.0, 0.0])
+    machine.device.sources[0] = lambda: t_q() - float(fallen_k(len(machine.outcomes)))
+    await machine.run(1300)
+    waits = ["t_q_at_exchanged" in outcome.offset.reasons for outcome in machine.outcomes]
+    assert any(waits[400:600]) and not any(waits[800:])
+    # The six hours before that, and all after it.
+    found = machine.opinion(QUILL, gain(-0.8))
+    assert found.verdict == "worse" and found.samples > 400 + 500
+
+
 async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
     """A model without most of the DTF; the one that is right up to 10 % is corrected by the probes and stays."""
     machine = ProbedMachine(tmp_path)

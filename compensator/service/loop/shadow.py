@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from compensator.codes import ProbeCode, Reason
+from compensator.codes import ProbeCode
 from compensator.config import Config
 from compensator.events import ComparisonData, EventKind
 from compensator.messages import SCHEMA, Candidate, Probe
@@ -63,13 +63,7 @@ class Shadow:
         received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
         self.compensation.receive_probes([probe for probe in received if probe is not None])
         other = self.compensation.process(outcome.sample)
-        if self.compensation.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in outcome.offset.reasons:
-            # Wires that are right again are so for every model. A warm-up passes samples, zeros and probes, and no
-            # commands: where the present state is unknown a person has seen to them; else measured Y has shown it.
-            if Reason.COLD_START in outcome.offset.reasons:
-                self.compensation.resume()
-            else:
-                self.compensation.plausibility.acknowledge()
+        self.compensation.believe_wires(outcome.offset.reasons)
         return msgspec.structs.replace(outcome, probes=probes), other
 
 

@@ -67,6 +67,7 @@ class ModelCandidate:
             if note.kind == EventKind.ZERO:
                 self.compensation.zero(note.data["mode"])
         self.compensation.process(sample)
+        self.compensation.believe_wires(outcome.offset.reasons)
 
     def figures(self) -> dict[str, Any]:
         """Return the extent of its warm-up for events and replies."""
@@ -190,6 +191,8 @@ class RecordedRun:
         result = self._free.run(step, commands=self._probes and step.sample is not None)
         if not isinstance(result, Outcome):
             return None
+        if step.offset is not None:
+            self.compensation.believe_wires(step.offset.reasons)
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
