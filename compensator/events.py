@@ -280,8 +280,9 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
         Why the candidate cannot be used.
     needs : str
         What a person has to do.
-    y_drifted : bool
-        Whether measured Y has moved by itself: a drift or a step of it was named.
+    y_moved_utc_ns : int
+        When measured Y last moved by itself, ns since 1970 UTC: a step of it was named, or a drift, which goes on to
+        the end; 0 if none was.
     from_utc_ns, to_utc_ns : int
         What was diagnosed, ns since 1970 UTC.
     seconds : float
@@ -298,7 +299,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     in_shadow: bool = False
     refused: str = ""
     needs: str = ""
-    y_drifted: bool = False
+    y_moved_utc_ns: int = 0
     from_utc_ns: int = 0
     to_utc_ns: int = 0
     seconds: float = 0.0

@@ -11,6 +11,7 @@ import numpy as np
 
 from compensator.api.diagnosis import DiagnosisResult, diagnose
 from compensator.arrays import Vector
+from compensator.clock import NS
 from compensator.codes import ModelWarning
 from compensator.config import Config
 from compensator.data.frames import hash_of
@@ -27,8 +28,8 @@ from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
-#: Effects by which measured Y moves to another level by itself.
-_OF_Y = ("drift", "step")
+#: Effects by which measured Y moves to another level by itself: for good, or at a time.
+_DRIFT, _STEP = "drift", "step"
 
 #: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing, or nothing that is deployed.
 SHORTEST_H, FEWEST_PROBES = SHORT_H, 12
@@ -61,9 +62,7 @@ def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um
     return summarised(*diagnoses_of_table(usable_table(record), model, probe_std_um=probe_std_um), model)
 
 
-def diagnoses_of_table(
-    table: Table, model: bytes, *, probe_std_um: float | None = None
-) -> tuple[DiagnosisResult, DiagnosisResult]:
+def diagnoses_of_table(table: Table, model: bytes, *, probe_std_um: float | None = None) -> tuple[Part, Part]:
     """Diagnose a table of `service.loop.record`: all of it, and ends of it if they explain themselves better.
 
     An effect that began or ended within the record explains no whole of it. Where a part is not explained well, its end
@@ -72,7 +71,7 @@ def diagnoses_of_table(
 
     Returns
     -------
-    DiagnosisResult, DiagnosisResult
+    Part, Part
         The diagnosis to go by, and that of the whole.
 
     Raises
@@ -83,14 +82,14 @@ def diagnoses_of_table(
     if not np.isfinite(table.columns["y_um"]).any():
         raise DataError(f"{table.name}: no measured Y that may be used")
     base = parse_model(model, source="calibrated model")
-    whole = best = last = _Part.of(table, base, probe_std_um)
+    whole = best = last = Part.of(table, base, probe_std_um)
     while last.left > WELL_EXPLAINED:
         from_s = last.ends_from_s()
         end = _end_of(last.table, from_s)
         if end is None:
             break
         try:
-            last = _Part.of(end, base, probe_std_um)
+            last = Part.of(end, base, probe_std_um)
         except CompensatorError:  # too little data in so short an end
             break
         if last.found.diagnosis.shows_nothing:
@@ -98,19 +97,30 @@ def diagnoses_of_table(
             best = best if best.holds_after(from_s) else last
         elif last.left < END_IS_BETTER * best.left:
             best = last
-    return best.found, whole.found
+    return best, whole
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """A part of a record, what its diagnosis found, and which part of its error on held-out data that leaves."""
+class Part:
+    """A part of a record, and what its diagnosis found.
+
+    Parameters
+    ----------
+    table : Table
+        The part; the time counts from 1970.
+    found : DiagnosisResult
+        Its diagnosis.
+    left : float
+        Which part of its error on held-out data that leaves.
+    """
 
     table: Table
     found: DiagnosisResult
     left: float
 
     @classmethod
-    def of(cls, table: Table, base: ThermalModel, probe_std_um: float | None) -> _Part:
+    def of(cls, table: Table, base: ThermalModel, probe_std_um: float | None) -> Part:
+        """Diagnose a part."""
         found = _diagnosed(table, base, probe_std_um)
         return cls(table, found, left_part(found.diagnosis))
 
@@ -128,6 +138,17 @@ class _Part:
         diagnosis, after = self.found.diagnosis, self._times_s >= from_s
         left_um, before_um = diagnosis.residual_after[after], diagnosis.residual_before[after]
         return bool(np.nanstd(left_um) < np.nanstd(before_um))
+
+    @property
+    def y_moved_s(self) -> float:
+        """When measured Y last moved by itself, s since 1970; 0 if it has not. A drift goes on to the end."""
+        begin_s, times_s = float(self.table.t_s.min()), [0.0]
+        for effect in self.found.effects:
+            if effect.kind == _DRIFT:
+                times_s.append(float(self.table.t_s.max()))
+            elif effect.kind == _STEP:
+                times_s.append(begin_s + 60.0 * effect.named["at_min"])
+        return max(times_s)
 
     @property
     def _times_s(self) -> Vector:
@@ -157,8 +178,9 @@ def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> 
     return found
 
 
-def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> Diagnosed:
+def summarised(part: Part, whole: Part, model: bytes) -> Diagnosed:
     """Return the result of a diagnosis of a model as the loop needs it; what a person has to do also by the whole."""
+    found = part.found
     base = parse_model(model, source="calibrated model")
     effects = tuple(name_of(effect) for effect in found.model.effects[len(base.effects) :])
     text = f"diagnosis: {found.verdict}, {', '.join(effects) or 'nothing to deploy'}"
@@ -166,9 +188,9 @@ def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> 
     text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
     extended = dump_model(found.model).encode() if effects else None
     # Where an effect begins within the record the whole of it may take that for a step; its end, explained, does not.
-    go_by = (found,) if found.verdict == "explained" else (found, whole)
-    y_drifted = any(effect.kind in _OF_Y for one in go_by for effect in one.effects)
-    return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole), y_drifted)
+    go_by = (part,) if found.verdict == "explained" else (part, whole)
+    y_moved_utc_ns = round(max(one.y_moved_s for one in go_by) * NS)
+    return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole.found), y_moved_utc_ns)
 
 
 def _needs(found: DiagnosisResult) -> str:

@@ -52,15 +52,15 @@ def _diagnose(job: Job, folder: Path) -> Result:
     record = read_record(job)
     table = table_of_rows(record.rows, record.probes, job.machine, zeros_ns=record.zeros_ns)
     model = read_file(folder / CALIBRATED, MODEL_BYTES)
-    found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
-    found.save_all(folder)
-    short = summarised(found, whole, model)
+    part, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
+    part.found.save_all(folder)
+    short = summarised(part, whole, model)
     return Result(
         verdict=short.verdict,
         effects=list(short.effects),
         text=short.text,
         needs=short.needs,
-        y_drifted=short.y_drifted,
+        y_moved_utc_ns=short.y_moved_utc_ns,
     )
 
 

@@ -25,6 +25,8 @@ from tests.service.simulated import config
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 DAY = 1440
+#: A time after every zero of a test, ns since 1970 UTC.
+LATER_NS = 1 << 62
 LIMITS = {
     "offset_max_um": 200.0,
     "offset_rate_max_um_per_min": 8.0,

@@ -9,7 +9,8 @@ import pytest
 
 import compensator.api.loop as api
 from compensator.api.diagnosis import DiagnosisResult
-from compensator.api.loop import _diagnosed, diagnoses_of_table, diagnosis_of_record
+from compensator.api.loop import Part, _diagnosed, diagnoses_of_table, diagnosis_of_record
+from compensator.clock import NS
 from compensator.data.table import Table
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import usable_table
@@ -20,7 +21,7 @@ from tests.service.test_restart import QUILL
 
 #: Both tests of an effect that began within the record ask about the same one: it is searched once.
 once = pytest.mark.usefixtures("equal_questions_once")
-SAMPLES, BEGINS = 1440, 480
+SAMPLES, BEGINS, KNOCKED = 1440, 480, 800
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +32,10 @@ def begun() -> list[Outcome]:
 
 
 @pytest.fixture(scope="module")
-def knocked() -> DiagnosisResult:
+def knocked() -> Part:
     """Diagnosis of a machine whose mount was knocked."""
     loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
-    steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > 800)))
+    steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > KNOCKED)))
     return diagnoses_of_table(usable_table([step.outcome for step in steps]), QUILL)[0]
 
 
@@ -44,19 +45,22 @@ def test_an_effect_that_began_within_the_record_is_found_in_the_end_of_it(begun:
     assert found.model is not None and "coolant_degc" in " ".join(found.effects)
 
 
-def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate(knocked: DiagnosisResult) -> None:
+def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate(knocked: Part) -> None:
     found = api.summarised(knocked, knocked, QUILL)
-    assert found.model is None and found.effects == () and "step" in found.needs and found.y_drifted
+    assert found.model is None and found.effects == () and "step" in found.needs
+    begin_ns = round(float(knocked.table.t_s.min()) * NS)
+    assert (found.y_moved_utc_ns - begin_ns) / (60 * NS) == pytest.approx(KNOCKED, abs=3)
 
 
 @once
 def test_a_step_that_only_the_whole_of_a_record_shows_is_the_begin_of_what_its_end_explains(
-    begun: list[Outcome], knocked: DiagnosisResult
+    begun: list[Outcome], knocked: Part
 ) -> None:
     end, _ = diagnoses_of_table(usable_table(begun), QUILL)
-    assert end.verdict == "explained" and not api.summarised(end, knocked, QUILL).y_drifted
-    unexplained = dataclasses.replace(end, diagnosis=dataclasses.replace(end.diagnosis, verdict="partly_explained"))
-    assert api.summarised(unexplained, knocked, QUILL).y_drifted
+    assert end.found.verdict == "explained" and not api.summarised(end, knocked, QUILL).y_moved_utc_ns
+    partly = dataclasses.replace(end.found.diagnosis, verdict="partly_explained")
+    unexplained = dataclasses.replace(end, found=dataclasses.replace(end.found, diagnosis=partly))
+    assert api.summarised(unexplained, knocked, QUILL).y_moved_utc_ns
 
 
 @once

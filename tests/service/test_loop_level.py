@@ -27,7 +27,19 @@ from compensator.service.replay import opening_of
 from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
-from tests.service.looping import DAY, Night, crept, decisions, errors, extended, machine, run, settings, shown
+from tests.service.looping import (
+    DAY,
+    LATER_NS,
+    Night,
+    crept,
+    decisions,
+    errors,
+    extended,
+    machine,
+    run,
+    settings,
+    shown,
+)
 from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
@@ -95,13 +107,26 @@ def test_such_a_candidate_is_adopted_after_a_zero():
 
 def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level():
     """A diagnosis has named the drift: a candidate that follows it would be the better one about the zero, too."""
-    found = dataclasses.replace(shown(extended()), y_drifted=True)
+    found = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
     samples = machine(3 * DAY)
     loop = LoopRun(settings(), QUILL_FILE, Night(found, shown(extended())))
     steps = run(loop, samples, 2000)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
     loop.compensation.zero("warm")
     steps += run(loop, samples, DAY)
+    assert "adopt" in [step for _, step, _ in decisions(steps)]
+
+
+def test_what_measured_y_did_before_the_last_zero_says_nothing_against_a_level_about_it():
+    """A mount slipped, a person set a zero: diagnoses go on naming the slip for as long as it is on record."""
+    samples = machine(3 * DAY)
+    night = Night(shown(None, "adequate"), shown(extended()))
+    loop = LoopRun(settings(), QUILL_FILE, night)
+    steps = run(loop, samples, 500)
+    slipped = steps[-1].outcome.sample.time_utc_ns
+    night.found[1] = dataclasses.replace(night.found[1], y_moved_utc_ns=slipped)
+    loop.compensation.zero("warm")
+    steps += run(loop, samples, 2 * DAY + 500)
     assert "adopt" in [step for _, step, _ in decisions(steps)]
 
 
@@ -121,7 +146,7 @@ def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clea
 )
 def test_what_explains_most_of_a_record_without_a_drift_refutes_it(verdict, every_h, is_adopted):
     """The beginning of an effect was called a drift; half a day later most of that record is explained without one."""
-    drifted, later = dataclasses.replace(shown(extended()), y_drifted=True), shown(extended(2.9), verdict)
+    drifted, later = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS), shown(extended(2.9), verdict)
     loop = LoopRun(settings(loop={"every_h": every_h}), QUILL_FILE, Night(drifted, *[later] * 9))
     steps = run(loop, machine(3 * DAY), 2 * DAY)
     assert ("adopt" in [step for _, step, _ in decisions(steps)]) == is_adopted

@@ -24,7 +24,7 @@ from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.audit.made import CONFIG
-from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
+from tests.service.looping import DAY, LATER_NS, Night, decisions, errors, extended, machine, run, settings, shown
 from tests.service.probed import COOLANT, PROBE, SENSOR
 from tests.service.test_restart import QUILL
 
@@ -337,10 +337,10 @@ def without_sensor(**changes: Any) -> Config:
     return msgspec.structs.replace(found, channel=[one for one in found.channel if one.name != "y_um"])
 
 
-@pytest.mark.parametrize("y_drifted", [False, True])
-def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice(y_drifted: bool) -> None:
+@pytest.mark.parametrize("y_moved_utc_ns", [0, LATER_NS])
+def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice(y_moved_utc_ns: int) -> None:
     """A drift that is named is no reason to wait for a zero: what creeps both models are corrected for."""
-    found_by_night = dataclasses.replace(shown(extended()), y_drifted=y_drifted)
+    found_by_night = dataclasses.replace(shown(extended()), y_moved_utc_ns=y_moved_utc_ns)
     loop = LoopRun(without_sensor(), QUILL, Night(found_by_night))
     source = list(machine(int(2.4 * DAY), noise_um=0.0))
     steps = probed(loop, iter(source), 30)

@@ -52,7 +52,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     effects: list[str] = []
     text: str = ""
     needs: str = ""
-    y_drifted: bool = False
+    y_moved_utc_ns: int = 0
 
     def write(self, path: Path) -> None:
         """Write it atomically."""

@@ -130,7 +130,8 @@ class Loop:
         record_ns = round(self._settings.record_h * _HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         state.error.update(present)
-        state.y_drifted_ns = 0 if sets_zero(present) else state.y_drifted_ns
+        if sets_zero(present):
+            state.zero_utc_ns, state.y_drifted_ns = now_ns, 0
         notes = self._forget_wrong() if was_wrong(present) else []
         notes += self._wait(present, others, is_suspected=suspected)
         judged: list[Place] = []
@@ -257,10 +258,11 @@ class Loop:
     def _judge_y(self, found: DiagnosisData, running: Running) -> None:
         """Remember that measured Y has moved by itself, until what explains most of that record finds it has not.
 
-        Where an effect begins in a record, it may look like a step or a drift of Y until there is more of it.
+        Where an effect begins in a record, it may look like a step or a drift of Y until there is more of it. What had
+        moved before the last zero is in that zero.
         """
         half_ns = round(0.5 * self._settings.record_h * _HOUR_NS)
-        if found.y_drifted:
+        if found.y_moved_utc_ns > self.state.zero_utc_ns:
             self.state.y_drifted_ns = running.to_utc_ns
         elif found.verdict == "explained" and running.from_utc_ns <= self.state.y_drifted_ns - half_ns:
             self.state.y_drifted_ns = 0

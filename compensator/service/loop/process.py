@@ -150,7 +150,7 @@ def _read(work: Path) -> Diagnosed:
         return failed(f"its result cannot be read: {error}")
     if result.verdict == FAILED:
         return failed(result.needs)
-    return Diagnosed(result.verdict, tuple(result.effects), model, result.text, result.needs, result.y_drifted)
+    return Diagnosed(result.verdict, tuple(result.effects), model, result.text, result.needs, result.y_moved_utc_ns)
 
 
 def _bytes_of(path: Path) -> bytes:

@@ -15,6 +15,7 @@ def forget_future(state: LoopState, now_ns: int) -> None:
     """Let nothing have happened after now: the clock was ahead, and was set back."""
     state.diagnosed_utc_ns = min(state.diagnosed_utc_ns, now_ns)
     state.adopted_utc_ns = min(state.adopted_utc_ns, now_ns)
+    state.zero_utc_ns = min(state.zero_utc_ns, now_ns)
     for place in state.taken:
         place.since_utc_ns = min(place.since_utc_ns, now_ns)
 

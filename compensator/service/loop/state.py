@@ -137,6 +137,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         Effects of the present model.
     error : ErrorBlocks
         Errors of the present model since the last zero.
+    zero_utc_ns : int
+        Time of the last zero, ns since 1970 UTC; 0 before.
     y_drifted_ns : int
         End of the record on which a diagnosis since then has found that measured Y had moved by itself, ns since 1970
         UTC; 0: none has, or a later one that explains most of that record has not.
@@ -162,6 +164,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     adopted_utc_ns: int = 0
     effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
+    zero_utc_ns: int = 0
     y_drifted_ns: int = 0
     avoided: list[Avoided] = []
 

@@ -43,8 +43,8 @@ class Diagnosed:
         One sentence for people.
     needs : str
         What a person has to do.
-    y_drifted : bool
-        Whether measured Y has moved by itself.
+    y_moved_utc_ns : int
+        When measured Y last moved by itself, ns since 1970 UTC; 0 if it has not.
     """
 
     verdict: str
@@ -52,7 +52,7 @@ class Diagnosed:
     model: bytes | None
     text: str
     needs: str = ""
-    y_drifted: bool = False
+    y_moved_utc_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,10 @@ def weigh(
 def without_candidate(found: Diagnosed) -> DiagnosisData:
     """Return the data of a diagnosis from which no candidate follows."""
     return DiagnosisData(
-        verdict=found.verdict, effects=list(found.effects), needs=found.needs, y_drifted=found.y_drifted
+        verdict=found.verdict,
+        effects=list(found.effects),
+        needs=found.needs,
+        y_moved_utc_ns=found.y_moved_utc_ns,
     )
 
 
