@@ -1,9 +1,10 @@
 """All figures of the project, in one table at the end: `make bench`. Nothing passes or fails here.
 
-python -m tests.bench                    everything but `drawn` and `loop`, which take hours, and `axes_effects`
+python -m tests.bench                    everything but what takes long: `drawn`, `loop`, `one_log`, `axes_effects`
 python -m tests.bench speed diagnosis    some of it
 python -m tests.bench drawn --help       drawn machines, with options of their own
 python -m tests.bench loop --help        the loop over machine-weeks, too
+python -m tests.bench one_log --help     drawn machines of which there is one log and no calibration, too
 """
 
 import sys
@@ -21,6 +22,7 @@ from tests.bench import (
     identification,
     loop,
     machines,
+    one_log,
     probe_calibration,
     probe_naming,
     probes,
@@ -57,8 +59,9 @@ LONG = ("drawn", "loop", "axes_effects")
 
 
 def main(chosen):
-    if chosen[:1] in (["drawn"], ["loop"]) and len(chosen) > 1 and chosen[1].startswith("-"):
-        {"drawn": drawn, "loop": loop}[chosen[0]].main(chosen[1:])
+    own = {"drawn": drawn, "loop": loop, "one_log": one_log}
+    if chosen and chosen[0] in own and (chosen[0] == "one_log" or (chosen[1:2] and chosen[1].startswith("-"))):
+        own[chosen[0]].main(chosen[1:])
         return
     unknown = set(chosen) - set(AREAS)
     if unknown:

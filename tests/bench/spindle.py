@@ -1,7 +1,6 @@
 """The measured spindle, through the commands: calibrate two inputs, diagnose, run what comes out on hours not seen.
 
-Beside it: no compensation, persistence (the last measured value stands), and a ridge regression over lags of every
-channel, its weight chosen on blocks of the hours that it was fitted to.
+Beside it: no compensation, persistence (the last measured value stands), and a ridge regression (`ridge.py`).
 """
 
 import contextlib
@@ -15,6 +14,7 @@ import numpy as np
 
 from compensator.cli import main
 from tests.bench.figures import Figure, rows, told
+from tests.bench.ridge import ridge
 
 FILE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 #: Hours of the fit, hours that judge.
@@ -40,42 +40,13 @@ def cut(folder, last_h):
     return path
 
 
-def lagged(u):
-    """Return a signal and its means over the last 5 min to 10 h, exponentially weighted."""
-    found = []
-    for tau in (1.0, 5.0, 20.0, 60.0, 180.0, 600.0):
-        out, p = np.zeros(u.size), np.exp(-1.0 / tau)
-        for i in range(1, u.size):
-            out[i] = p * out[i - 1] + (1.0 - p) * (u[i] - u[0])
-        found.append(out)
-    return np.stack(found, axis=1)
-
-
-def ridge(y, used):
+def by_ridge(y, used):
     """Predict by every temperature and the speed behind lags."""
     with FILE.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     names = [name for name in rows[0] if name.endswith(("_degc", "_rpm"))]
-    minutes = y.size
-    table = np.concatenate(
-        [lagged(np.array([float(r[n]) for r in rows])[: 4 * minutes].reshape(-1, 4).mean(axis=1)) for n in names],
-        axis=1,
-    )
-    table = np.column_stack([table / (table[used].std(axis=0) + 1e-9), np.ones(minutes)])
-
-    def fitted(mask, weight):
-        x = table[mask]
-        return np.linalg.solve(x.T @ x + weight * mask.sum() * np.eye(x.shape[1]), x.T @ y[mask])
-
-    def left(weight):
-        total = 0.0
-        for block in np.array_split(np.flatnonzero(used), 5):
-            mask = used.copy()
-            mask[block] = False
-            total += float(np.sum((table[block] @ fitted(mask, weight) - y[block]) ** 2))
-        return total
-
-    return table @ fitted(used, min((1e-4, 1e-3, 1e-2, 1e-1), key=left))
+    every_15_s = (np.array([float(r[n]) for r in rows])[: 4 * y.size] for n in names)
+    return ridge([channel.reshape(-1, 4).mean(axis=1) for channel in every_15_s], y, used)
 
 
 def one(probe, fit_h, judge_h):
@@ -96,7 +67,7 @@ def one(probe, fit_h, judge_h):
     used = np.zeros(y.size, dtype=bool)
     used[fit_h[0] * 60 : fit_h[1] * 60] = True
     predicted |= {"none": np.zeros(y.size), "persistence": np.full(y.size, y[judge_h[0] * 60 - 1])}
-    predicted["ridge, all"] = ridge(y, used)
+    predicted["ridge, all"] = by_ridge(y, used)
     errors = {
         label: (
             float(np.sqrt(np.nanmean((y - p)[judged] ** 2))),
