@@ -19,7 +19,8 @@ from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.outcome import rms_of
 
 #: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor. It is not near 1:
-#: each block may hold an event of its own, and the others then know less of an effect, and may name it otherwise.
+#: each block may hold an event of its own, and the others then know less of an effect, and may name it otherwise. But
+#: what leaves more of them than both the base and no compensation foretells nothing.
 CONTRADICTS = 2.5
 #: Nor where the data that were searched are predicted worse with it in free run by more than this factor.
 WORSE = 1.25
@@ -84,6 +85,11 @@ class Deployment:
         """Whether nothing is deployed."""
         is_worse, is_too_short = self.worse_um is not None, self.too_short_h is not None
         return self.contradicted or self.reverses_path or is_worse or is_too_short or self.explains_nothing
+
+    @property
+    def needs_known_paths(self) -> bool:
+        """Whether paths that were fitted anew foretell nothing of held-out blocks."""
+        return self.contradicted and self.found.search.evidence.free_paths
 
     @property
     def base_foretells_better(self) -> bool:
@@ -246,8 +252,10 @@ def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
 
 def _is_contradicted(found: Findings, held_out: HeldOut) -> bool:
     """Return whether held-out blocks contradict what was found; few values do not decide that."""
-    is_sparse = found.search.evidence.is_sparse
-    return not is_sparse and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
+    evidence, whole_um, nothing_um = found.search.evidence, rms_of(held_out.whole), rms_of(held_out.nothing)
+    # Worse than the base and than no compensation: they foretell nothing.
+    is_useless = whole_um >= max(nothing_um, evidence.spread_um)
+    return not evidence.is_sparse and (is_useless or whole_um > CONTRADICTS * nothing_um)
 
 
 def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:

@@ -136,7 +136,7 @@ def _diagnosed(
     held_out = held_out_of(found, places, progress, executor_map)
     chosen = deployment_of(found, effects, held_out)
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
-    if unseen and chosen.base_foretells_better:
+    if chosen.needs_known_paths or (unseen and chosen.base_foretells_better):
         return _diagnosed(
             model,
             runs,
