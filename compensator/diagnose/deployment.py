@@ -88,8 +88,8 @@ class Deployment:
 
     @property
     def needs_known_paths(self) -> bool:
-        """Whether paths that were fitted anew foretell nothing of held-out blocks."""
-        return self.contradicted and self.found.search.evidence.free_paths
+        """Whether nothing is deployed of a search in which nothing was known of the paths: they stay as they are."""
+        return self.is_refused and self.found.search.evidence.free_paths
 
     @property
     def base_foretells_better(self) -> bool:
@@ -97,7 +97,9 @@ class Deployment:
         return self.found.search.evidence.free_paths and rms_of(self.held_out.base) < rms_of(self.held_out.whole)
 
 
-def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut) -> Deployment:
+def deployment_of(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, *, contradicts: float = CONTRADICTS
+) -> Deployment:
     """Decide what of the findings is deployed.
 
     Parameters
@@ -108,18 +110,20 @@ def deployment_of(found: Findings, effects: tuple[FoundEffect, ...], held_out: H
         The named effects.
     held_out : HeldOut
         Errors on held-out blocks.
+    contradicts : float
+        Factor by which these may be larger with what is deployed.
     """
-    decided = _decided(*_with_remainder_that_helps(found, effects, held_out))
-    decided = _by_channels(decided) or decided
+    decided = _decided(*_with_remainder_that_helps(found, effects, held_out), contradicts)
+    decided = _by_channels(decided, contradicts) or decided
     return dataclasses.replace(decided, effects=_not_replaced(decided.effects)) if decided.is_refused else decided
 
 
-def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut) -> Deployment:
+def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float) -> Deployment:
     return Deployment(
         found=found,
         effects=effects,
         held_out=held_out,
-        contradicted=_is_contradicted(found, held_out),
+        contradicted=_is_contradicted(found, held_out, contradicts),
         worse_um=_worse_in_free_run(found),
         too_short_h=_too_short_h(found, effects, held_out),
     )
@@ -189,7 +193,7 @@ def _as_far_as_confirmed(
     return found, effects, dataclasses.replace(held_out, whole=whole)
 
 
-def _by_channels(decided: Deployment) -> Deployment | None:
+def _by_channels(decided: Deployment, contradicts: float) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
     # Paths that were fitted anew would stay, and they are what is contradicted.
     is_refuted = decided.contradicted and not decided.found.search.evidence.free_paths
@@ -198,7 +202,8 @@ def _by_channels(decided: Deployment) -> Deployment | None:
     if found is None or not _is_confirmed(found, decided, names_are_useless=useless):
         return None
     effects = tuple(dataclasses.replace(effect, replaced=True, left_in=False) for effect in decided.effects)
-    instead = _decided(found, effects, dataclasses.replace(decided.held_out, whole=decided.held_out.ceiling))
+    held_out = dataclasses.replace(decided.held_out, whole=decided.held_out.ceiling)
+    instead = _decided(found, effects, held_out, contradicts)
     return None if instead.is_refused else instead
 
 
@@ -250,12 +255,12 @@ def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
     return tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
 
 
-def _is_contradicted(found: Findings, held_out: HeldOut) -> bool:
+def _is_contradicted(found: Findings, held_out: HeldOut, contradicts: float) -> bool:
     """Return whether held-out blocks contradict what was found; few values do not decide that."""
     evidence, whole_um, nothing_um = found.search.evidence, rms_of(held_out.whole), rms_of(held_out.nothing)
     # Worse than the base and than no compensation: they foretell nothing.
     is_useless = whole_um >= max(nothing_um, evidence.spread_um)
-    return not evidence.is_sparse and (is_useless or whole_um > CONTRADICTS * nothing_um)
+    return not evidence.is_sparse and (is_useless or whole_um > contradicts * nothing_um)
 
 
 def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:

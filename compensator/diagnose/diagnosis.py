@@ -20,7 +20,7 @@ from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import deployment_of, is_adequate
+from compensator.diagnose.deployment import CONTRADICTS, deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, in_free_run
@@ -118,8 +118,13 @@ def _diagnosed(
     unseen: bool,
     progress: Progress,
     executor_map: ExecutorMap,
+    is_off: bool = False,
 ) -> Diagnosis:
-    """Diagnose all of the data; see `diagnose`."""
+    """Diagnose all of the data; see `diagnose`.
+
+    `is_off`: a search for paths fitted anew has given nothing that is deployed, so these are kept. The base is far off
+    all the same, and has seen the data: effects beside it have to show that they foretell them.
+    """
     evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
     evidence = evidence_of_runs(runs)
     searches = 1 + len(list(evidence.blocks(FOLDS)))
@@ -134,7 +139,7 @@ def _diagnosed(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects if not effect.left_in]
     held_out = held_out_of(found, places, progress, executor_map)
-    chosen = deployment_of(found, effects, held_out)
+    chosen = deployment_of(found, effects, held_out, contradicts=1.0 if is_off else CONTRADICTS)
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     if chosen.needs_known_paths or (unseen and chosen.base_foretells_better):
         return _diagnosed(
@@ -145,13 +150,16 @@ def _diagnosed(
             unseen=False,
             progress=after(progress, searches),
             executor_map=executor_map,
+            is_off=chosen.needs_known_paths,
         )
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
     ceiling = _ceiling(held_out)
-    verdict, is_explained = _verdict(found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None)
+    verdict, is_explained = _verdict(
+        found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None, is_off=is_off
+    )
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
@@ -440,6 +448,7 @@ def _verdict(
     extended: ThermalModel,
     *,
     holds_in_free_run: bool,
+    is_off: bool,
 ) -> tuple[Verdict, bool]:
     """Return the verdict in one word, and whether nothing is left to look for.
 
@@ -457,7 +466,7 @@ def _verdict(
 
     is_noise = leaves_noise(found.whole + found.left_in_um)
     if not observed:
-        if is_adequate(found, held_out):
+        if is_adequate(found, held_out) and not is_off:
             return "adequate", False
         # Noise in the fit, and more on held-out blocks: in the residual is nothing to look for.
         return "unexplained", found.remainder is None and not evidence.free_paths and found.leaves_noise

@@ -18,11 +18,13 @@ DISPLACEMENT = ("_um", "_urad")
 #: temperatures, speeds and loads of the measured spindle and of every eighth drawn development machine it is at most
 #: 0.22, of the spindle's probes beside each other 0.47 to 0.95, but for two pairs that tilt apart (0.25 to 0.34).
 SAME_NOISE, LEAST = 0.4, 300
-#: Steps count no more than all but this share of samples does; a sample later, less than this share of the correlation
-#: of noise is left.
-QUIET, SHARP = 0.8, 0.3
+#: Second differences of more than so many times the noise are of steps, which a cause shares with Y, and do not count;
+#: a sample later, less than this share of the correlation of noise is left.
+QUIET, SHARP = 3.0, 0.3
 #: A channel is Y times a constant where it differs from it by so many times the noise of both, and moves by so many.
 ALIKE, MOVES = 2.0, 30.0
+#: Median of the absolute values of normal noise of size 1.
+MEDIAN_OF_NORMAL = 0.6745
 #: Values are the same to so many digits after the point: T_Q is stored as its difference from AT.
 _DIGITS = 9
 
@@ -90,11 +92,11 @@ def _noise_correlation(second: Matrix) -> float:
 
     Two smooth signals resemble each other a sample later as well, noise does not.
     """
-    most = np.quantile(np.abs(second), QUIET, axis=0)
-    limited = np.clip(second, -most, most)
-    spread = np.std(limited, axis=0)
-    if len(limited) < LEAST or np.any(spread == 0.0):
+    noise = np.median(np.abs(second), axis=0) / MEDIAN_OF_NORMAL
+    quiet = np.all(np.abs(second) < QUIET * noise, axis=1)
+    if np.count_nonzero(quiet) < LEAST:
         return 0.0
-    u, v = ((limited - limited.mean(axis=0)) / spread).T
-    now, beside = float(np.mean(u * v)), float(np.mean(u[1:] * v[:-1]) + np.mean(u[:-1] * v[1:])) / 2.0
+    known = np.where(quiet[:, None], second, np.nan)
+    u, v = ((known - np.nanmean(known, axis=0)) / np.nanstd(known, axis=0)).T
+    now, beside = float(np.nanmean(u * v)), float(np.nanmean(u[1:] * v[:-1]) + np.nanmean(u[:-1] * v[1:])) / 2.0
     return abs(now) if beside * np.sign(now) < SHARP * abs(now) else 0.0

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose.evidence import evidence_of
@@ -46,6 +47,16 @@ def test_causes_with_and_without_delay_and_noise_stay():
         pump_on=lambda table, rng: 1.0 * (rpm > 2000.0),
     )
     assert no_causes("day", runs) == {}
+
+
+def test_a_power_that_is_switched_as_often_as_a_programme_does_is_a_cause():
+    """Y bends at every switching: second differences of both are largest there, and that is no noise."""
+    rng = np.random.default_rng(12)
+    on = np.repeat(rng.permuted(np.arange(N // 2 + 1) % 2), 2)[:N] * (np.arange(N) // 240 % 2)
+    power_w = 3000.0 * on * (1.0 + 0.02 * rng.normal(size=N)) + rng.normal(0.0, 10.0, N)
+    table = machine() | {"spindle_power_w": power_w}
+    table["y_um"] = table["y_um"] + lfilter([0.1], [1.0, -0.9], 12.0 * on)
+    assert no_causes("day", runs_in(measurements(table, "day"))[0]) == {}
 
 
 def test_smooth_signals_without_noise_are_not_taken_for_measurements_of_y():

@@ -28,7 +28,7 @@ from compensator.model.effects.base import (
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.input import NEEDS_CHANNEL, half_time_min
-from compensator.model.effects.seen import FLOWS, Seen, digits, quantity, unit_in, with_unit
+from compensator.model.effects.seen import FLOWS, POWERS, Seen, digits, quantity, unit_in, with_unit
 from compensator.model.effects.signals import Signals
 
 
@@ -105,10 +105,12 @@ class FlowBank(Flow):
 
 @proposes
 def flows(context: Context) -> Iterator[Hypothesis]:
-    """Propose every temperature as that of a fluid whose flow is a channel with a zero of its own."""
+    """Propose every temperature as that of a fluid whose flow is a channel with a zero of its own; a power is none."""
     half = Free(name="half", low=0.01, high=100.0, grid=(0.03, 0.3, 3.0))
     one, several = context.tau(), context.bank_min
     for channel in sorted(context.zeroed):
+        if unit_in(channel) in POWERS:
+            continue
         is_flow = unit_in(channel) in FLOWS
         # A speed in the place of a flow fits too much if a surface may follow it, too.
         searched = (half, context.surface()) if is_flow else (half,)

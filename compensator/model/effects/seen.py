@@ -191,6 +191,7 @@ def unit_of_channel(channel: str) -> str:
 #: Units of what can be nothing but a flow, and of what moves the medium of a film: a speed, or a flow. A power or a
 #: load may stand for the heat itself.
 FLOWS = ("lpm", "l_per_min", "l_per_h", "m3_per_h", "kg_per_min", "gpm")
+POWERS = ("w", "kw")
 MOVES = ("rpm", "1_per_min", *FLOWS)
 
 
