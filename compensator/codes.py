@@ -517,7 +517,7 @@ class ModelWarning(Code):
     PATHS_KEPT = (
         "paths_kept",
         "The base model misses much of its own calibration, and its paths were kept as they are.",
-        "Calibrate it anew, or record for longer (without --keep-paths paths are fitted together with effects).",
+        "Calibrate it anew, or record for longer (--keep-paths keeps them in any case).",
     )
 
 

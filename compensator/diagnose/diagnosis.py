@@ -198,7 +198,7 @@ def _diagnosed(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found, effects),
-        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed), *warnings),
+        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off), *warnings),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),
         ceiling=ceiling,
@@ -245,13 +245,15 @@ def _is_far_off(evidence: Evidence) -> bool:
     return own_um2 > (FAR_OFF * evidence.spread_um) ** 2
 
 
-def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool) -> list[Remark]:
+def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off: bool = False) -> list[Remark]:
     """Return the remark that paths were kept which would be fitted anew, where something is missing."""
     if verdict == "adequate" or (evidence.free_paths and deployed) or not _is_far_off(evidence):
         return []
+    left_um = evidence.model.held_out_rms_um or 0.0
+    why = "paths fitted anew foretold nothing, so its own were kept" if is_off else "its paths were kept"
     text = (
-        f"The calibration of the model left {evidence.model.held_out_rms_um:.1f} µm rms, much of the "
-        f"{evidence.spread_um:.1f} µm by which Y varies here, and its paths were kept."
+        f"The calibration of the model left {left_um:.1f} µm rms, {100.0 * left_um / evidence.spread_um:.0f} % of the "
+        f"{evidence.spread_um:.1f} µm by which Y varies here, and {why}."
     )
     return [Remark(ModelWarning.PATHS_KEPT, text)]
 
