@@ -23,8 +23,6 @@ SAME_NOISE, LEAST = 0.4, 300
 QUIET, SHARP = 3.0, 0.3
 #: A channel is Y times a constant where it differs from it by so many times the noise of both, and moves by so many.
 ALIKE, MOVES = 2.0, 30.0
-#: Median of the absolute values of normal noise of size 1.
-_MEDIAN_OF_NORMAL = 0.6745
 #: Values are the same to so many digits after the point: T_Q is stored as its difference from AT.
 _DIGITS = 9
 
@@ -92,7 +90,7 @@ def _noise_correlation(second: Matrix) -> float:
 
     Two smooth signals resemble each other a sample later as well, noise does not.
     """
-    noise = np.median(np.abs(second), axis=0) / _MEDIAN_OF_NORMAL
+    noise = np.median(np.abs(second), axis=0) / 0.6745  # of normal noise
     quiet = np.all(np.abs(second) < QUIET * noise, axis=1)
     if np.count_nonzero(quiet) < LEAST:
         return 0.0
