@@ -118,7 +118,9 @@ def deployment_of(
     return dataclasses.replace(decided, effects=_not_replaced(decided.effects)) if decided.is_refused else decided
 
 
-def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float) -> Deployment:
+def _decided(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float = CONTRADICTS
+) -> Deployment:
     return Deployment(
         found=found,
         effects=effects,
@@ -193,7 +195,7 @@ def _as_far_as_confirmed(
     return found, effects, dataclasses.replace(held_out, whole=whole)
 
 
-def _by_channels(decided: Deployment, contradicts: float) -> Deployment | None:
+def _by_channels(decided: Deployment, contradicts: float = CONTRADICTS) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
     # Paths that were fitted anew would stay, and they are what is contradicted.
     is_refuted = decided.contradicted and not decided.found.search.evidence.free_paths

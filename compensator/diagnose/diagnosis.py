@@ -122,8 +122,8 @@ def _diagnosed(
 ) -> Diagnosis:
     """Diagnose all of the data; see `diagnose`.
 
-    `is_off`: a search for paths fitted anew has given nothing that is deployed, so these are kept. The base is far off
-    all the same, and has seen the data: effects beside it have to show that they foretell them.
+    `is_off`: a search for paths fitted anew has given nothing that is deployed, so those of the base are kept. It is
+    far off all the same, and has seen the data: effects beside it have to show that they foretell them.
     """
     evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
     evidence = evidence_of_runs(runs)
@@ -150,7 +150,7 @@ def _diagnosed(
             unseen=False,
             progress=after(progress, searches),
             executor_map=executor_map,
-            is_off=chosen.needs_known_paths,
+            is_off=not unseen,
         )
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
@@ -395,8 +395,8 @@ def _with_deviation(
         # small, the other has few blocks. What is open of the parameters the effects state by themselves.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
-    if not deploys and evidence.free_paths:
-        # What the base leaves is not what paths that are not deployed would.
+    if not deploys and _is_far_off(evidence):
+        # What is learned beside paths, or an own error, that are not deployed says nothing of what the base leaves.
         left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.
     late = late_variance_um2(extended) - late_variance_um2(model)

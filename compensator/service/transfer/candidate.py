@@ -191,8 +191,10 @@ class RecordedRun:
         result = self._free.run(step, commands=self._probes and step.sample is not None)
         if not isinstance(result, Outcome):
             return None
-        if step.offset is not None:
-            self.compensation.believe_wires(step.offset.reasons)
+        # An offset that cannot be read says nothing of them.
+        with suppress(DataError):
+            if self.compensation.plausibility.exchanged and step.offset is not None:
+                self.compensation.believe_wires(step.offset.reasons)
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
