@@ -28,7 +28,7 @@ from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
-#: Effects by which measured Y moves to another level by itself: for good, or at a time.
+#: Effects by which measured Y moves by itself: it goes on, or happened once.
 _DRIFT, _STEP = "drift", "step"
 
 #: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing, or nothing that is deployed.

@@ -250,7 +250,7 @@ def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off:
     if verdict == "adequate" or (evidence.free_paths and deployed) or not _is_far_off(evidence):
         return []
     left_um = evidence.model.held_out_rms_um or 0.0
-    why = "paths fitted anew foretold nothing, so its own were kept" if is_off else "its paths were kept"
+    why = "nothing came of paths fitted anew, so its own were kept" if is_off else "its paths were kept"
     text = (
         f"The calibration of the model left {left_um:.1f} µm rms, {100.0 * left_um / evidence.spread_um:.0f} % of the "
         f"{evidence.spread_um:.1f} µm by which Y varies here, and {why}."
