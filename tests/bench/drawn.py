@@ -17,11 +17,8 @@ stated          rms of the error over rms of the stated deviation: right from 0.
 """
 
 import argparse
-import json
-import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,6 +26,7 @@ import numpy as np
 
 import compensator as tc
 from sim_hardware.drawn_machines import DEVELOPMENT, FAMILIES, SEALED, SEALED_RUNS
+from tests.bench.cases import judge, named
 from tests.bench.figures import Figure, rows, told
 
 SETS = {"development": DEVELOPMENT, "sealed": SEALED}
@@ -53,16 +51,16 @@ def names(truth, *, direct):
 
 
 def judged(case):
-    """Return the figures of a case as a dict that JSON can hold."""
+    """Return the figures of a case as one dict that JSON can hold, in a list."""
     began = time.perf_counter()
     machine = case.draw()
     truth, result = machine.truth, asdict(case)
     result |= {"hours": machine.record.hours, "size_um": truth.size_um, "deployable": truth.deployable}
     result |= {"strength": f"{truth.strength:.3g} {truth.unit}", "draw_s": time.perf_counter() - began}
     try:
-        return result | _figures(machine)
+        return [result | _figures(machine)]
     except Exception as error:  # noqa: BLE001  a case that ends in an error is a wrong one, and the others go on
-        return result | {"failed": f"{type(error).__name__}: {error}"}
+        return [result | {"failed": f"{type(error).__name__}: {error}"}]
 
 
 def _figures(machine):
@@ -73,9 +71,9 @@ def _figures(machine):
     why = tc.diagnose(base, machine.record.columns)
     diagnosed = time.perf_counter()
     found = why.to_dict()
-    named = [tuple(effect[key] or "" for key in ("kind", "path", "channel")) for effect in found["effects"]]
+    places = [tuple(effect[key] or "" for key in ("kind", "path", "channel")) for effect in found["effects"]]
     right, tolerated = names(truth, direct=base.kind == "direct")
-    others = [place for place in named if place not in right | tolerated]
+    others = [place for place in places if place not in right | tolerated]
     best, _ = free_run(base, machine.healthy)
     before, _ = free_run(base, machine.fresh)
     after, stated = free_run(why.model, machine.fresh)
@@ -84,9 +82,9 @@ def _figures(machine):
     return {
         "model": "published" if machine.published else base.kind,
         "verdict": found["verdict"],
-        "found": [" ".join(filter(None, place)) for place in named],
-        "named": any(place in right for place in named) or (not right and not others),
-        "cleanly": (any(place in right for place in named) or not right) and not others,
+        "found": [named(place) for place in places],
+        "named": any(place in right for place in places) or (not right and not others),
+        "cleanly": (any(place in right for place in places) or not right) and not others,
         "best_um": best,
         "before_um": before,
         "after_um": after,
@@ -100,20 +98,14 @@ def _figures(machine):
 
 
 def run(cases, out, *, workers, resume=False):
-    """Judge cases in parallel; after each, everything so far is written to `out`."""
-    results = json.loads(out.read_text(encoding="utf-8")) if resume and out.exists() else []
-    done = {(r["family"], r["seed"]) for r in results}
-    cases = [case for case in cases if (case.family, case.seed) not in done]
+    """Judge cases in parallel, and print each."""
     # Families by turns, so that a run that is cut off says something of each.
-    cases.sort(key=lambda case: (case.seed, FAMILIES.index(case.family)))
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # Of the processes that are started now.
-        os.environ.setdefault(name, "1")
-    with ProcessPoolExecutor(workers) as pool:
-        for future in as_completed([pool.submit(judged, case) for case in cases]):
-            results.append(future.result())
-            sys.stdout.write(" | ".join(line(results[-1])) + "\n")
-            sys.stdout.flush()
-            out.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    cases = sorted(cases, key=lambda case: (case.seed, FAMILIES.index(case.family)))
+    results = []
+    for result in judge(cases, judged, out, workers=workers, resume=resume):
+        results.append(result)
+        sys.stdout.write(" | ".join(line(result)) + "\n")
+        sys.stdout.flush()
     return sorted(results, key=lambda r: (FAMILIES.index(r["family"]), r["seed"]))
 
 
@@ -162,7 +154,7 @@ def summary(results):
 
 def report(cases=DEVELOPMENT, out=Path("drawn-development.json"), *, workers=None, resume=False):
     """Yield the figures; every case is printed."""
-    results = run(cases, out, workers=workers or os.cpu_count(), resume=resume)
+    results = run(cases, out, workers=workers, resume=resume)
     rows("drawn machines, one by one (stated: error over stated deviation)", HEAD, [line(r) for r in results])
     yield from summary(results)
 

@@ -36,7 +36,6 @@ import json
 import math
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -51,6 +50,7 @@ from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopRun
 from sim_hardware.drawn_machines.weeks import DEVELOPMENT_WEEKS, SEALED_WEEK_RUNS, SEALED_WEEKS
+from tests.bench.cases import judge
 from tests.bench.figures import Figure, rows, told
 from tests.bench.loop_bound import Bound
 from tests.bench.loop_week import MINUTE_NS, config_of, error_of, rms, samples_of, undisturbed, whole
@@ -167,13 +167,13 @@ def looped(config, model, samples, diagnoses, *, kills=True):
 
 
 def judged(case):
-    """Return the figures of a machine-week as a dict that JSON can hold."""
+    """Return the figures of a machine-week as one dict that JSON can hold, in a list."""
     began = time.perf_counter()
     result = asdict(case)
     try:
-        return result | _figures(case.draw()) | {"seconds": time.perf_counter() - began}
+        return [result | _figures(case.draw()) | {"seconds": time.perf_counter() - began}]
     except Exception as error:  # noqa: BLE001  a week that ends in an error is a wrong one, and the others go on
-        return result | {"failed": f"{type(error).__name__}: {error}", "seconds": time.perf_counter() - began}
+        return [result | {"failed": f"{type(error).__name__}: {error}", "seconds": time.perf_counter() - began}]
 
 
 def _figures(week):
@@ -303,17 +303,13 @@ def _young(week, number, bound):
 
 
 def run(cases, out, *, workers, resume=False):
-    """Judge weeks in parallel; after each, everything so far is written to `out`."""
-    results = json.loads(out.read_text(encoding="utf-8")) if resume and out.exists() else []
-    done = {(r["family"], r["seed"]) for r in results}
-    cases = [case for case in cases if (case.family, case.seed) not in done]
-    with ProcessPoolExecutor(workers) as pool:
-        for future in as_completed([pool.submit(judged, case) for case in cases]):
-            results.append(future.result())
-            for cells in lines(results[-1]):
-                sys.stdout.write(" | ".join(cells) + "\n")
-            sys.stdout.flush()
-            out.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    """Judge weeks in parallel, and print each."""
+    results = []
+    for result in judge(cases, judged, out, workers=workers, resume=resume):
+        results.append(result)
+        for cells in lines(result):
+            sys.stdout.write(" | ".join(cells) + "\n")
+        sys.stdout.flush()
     return sorted(results, key=lambda r: r["seed"])
 
 

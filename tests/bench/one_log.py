@@ -10,10 +10,7 @@ about mean   the same about the mean of the hours that judge: the level of a mac
 """
 
 import argparse
-import json
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +18,7 @@ import numpy as np
 
 import compensator as tc
 from sim_hardware.drawn_machines import DEVELOPMENT
+from tests.bench.cases import judge, named
 from tests.bench.figures import Figure, rows, told
 from tests.bench.ridge import ridge
 
@@ -41,7 +39,7 @@ def errors(predicted, y, judged):
 
 
 def judged(case):
-    """Return the figures of both parts of a case."""
+    """Return the figures of both parts of a case as dicts that JSON can hold."""
     log = {name: np.asarray(u, float) for name, u in case.draw().record.columns.items() if name != "heat_w"}
     y = log["y_um"] = log["y_um"] - np.nanmedian(log["y_um"][:BEGIN])
     return [_of_share(case, log, y, share) for share in SHARES if share * y.size >= 60.0 * LEAST_H]
@@ -50,7 +48,7 @@ def judged(case):
 def _of_share(case, log, y, share):
     count = int(share * y.size)
     part = {name: u[:count] for name, u in log.items()}
-    result = {"machine": f"{case.family} {case.seed}", "effect": case.effect, "hours": y.size / 60.0, "share": share}
+    result = {"family": case.family, "seed": case.seed, "effect": case.effect, "hours": y.size / 60.0, "share": share}
     base = tc.identify(part).model
     why = tc.diagnose(base, part)
     used = np.arange(y.size) < count
@@ -62,7 +60,7 @@ def _of_share(case, log, y, share):
         "extended": tc.simulate(why.model, log)["y_pred_um"],
     }
     result |= {name: errors(predicted[name], y, ~used) for name in METHODS}
-    found = [" ".join(filter(None, (effect.kind, effect.path, effect.channel))) for effect in why.effects]
+    found = [named((effect.kind, effect.path, effect.channel)) for effect in why.effects]
     return result | {"verdict": why.verdict, "found": found}
 
 
@@ -82,21 +80,17 @@ def main(words):
 
 def report(cases, out, *, workers=None):
     """Yield the figures; every case is printed."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # Of the processes that are started now.
-        os.environ.setdefault(name, "1")
     results = []
-    with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
-        for future in as_completed([pool.submit(judged, case) for case in cases]):
-            results += future.result()
-            out.write_text(json.dumps(results, indent=1), encoding="utf-8")
-            sys.stdout.write(f"{len(results)}\r")
-            sys.stdout.flush()
+    for result in judge(cases, judged, out, workers=workers):
+        results.append(result)
+        sys.stdout.write(f"{len(results)}\r")
+        sys.stdout.flush()
     head = ["machine", "effect", "h", "fitted", *METHODS, "verdict", "found"]
     body = [
-        [r["machine"], r["effect"], f"{r['hours']:.0f}", f"{r['share']:.0%}"]
+        [f"{r['family']} {r['seed']}", r["effect"], f"{r['hours']:.0f}", f"{r['share']:.0%}"]
         + [f"{r[name][0]:.2f} ({r[name][1]:.2f})" for name in METHODS]
         + [r["verdict"], " + ".join(r["found"]) or "nothing"]
-        for r in sorted(results, key=lambda r: (r["machine"], r["share"]))
+        for r in sorted(results, key=lambda r: (r["family"], r["seed"], r["share"]))
     ]
     rows("one log of a machine, judged on the rest of it, µm rms about the zero (about the mean)", head, body)
     for i, about in enumerate(("zero", "mean")):
