@@ -7,7 +7,8 @@ import time
 from collections.abc import Awaitable, Callable, Collection
 from typing import Any, Protocol
 
-NS = 1_000_000_000
+#: Nanoseconds of a second and of an hour.
+NS, HOUR_NS = 1_000_000_000, 3_600_000_000_000
 
 
 def duration(seconds: float) -> str:

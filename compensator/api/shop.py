@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from compensator.api.loop import diagnosis_in_process
-from compensator.clock import NS
+from compensator.clock import HOUR_NS, NS
 from compensator.config import Config, Loop
 from compensator.errors import CompensatorError, DataError
 from compensator.events import CommandName, EventKind, LoopAction, Note, command_of
@@ -172,7 +172,7 @@ class _Summary:
             (self._probed, [(probe.time_utc_ns, number(probe.measured_um)) for probe in probes if probe.taken]),
         ):
             kept.extend(one for one in values if math.isfinite(one[1]))
-            while kept and kept[0][0] <= now_ns - NOW_H * 3600 * NS:
+            while kept and kept[0][0] <= now_ns - NOW_H * HOUR_NS:
                 kept.popleft()
 
     def add_events(self, events: Iterable[tuple[str, str, Any, int]]) -> None:
@@ -258,8 +258,11 @@ class _Followed:
         self.notes: tuple[Note, ...] = ()
 
     def __getattr__(self, name: str) -> Any:
-        """Return what is the same: model, status, zero, begin, hold, resume, fail, held, continue_from."""
+        """Return what is the same: model, status, zero, begin, hold, fail, held, continue_from."""
         return getattr(self._run.compensation, name)
+
+    def resume(self) -> None:
+        self._run.resume()
 
     def pause(self, samples: int | None) -> None:
         self._run.pause(samples)

@@ -20,14 +20,14 @@ import struct
 
 import msgspec
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.messages import SCHEMA, Chain, ChainLink, ChainPart, Seal, encode
 from compensator.recording.container import Attachment, Contents, McapChannel
 
 #: Value before the first file of a machine.
 NOTHING = bytes(32)
 #: How often the chain is signed within a file.
-SEAL_EVERY_NS = 3600 * NS
+SEAL_EVERY_NS = HOUR_NS
 
 _DOMAIN = b"compensator chain 1\n"
 _BODY = struct.Struct("<IQQ")

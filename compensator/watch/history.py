@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from msgspec import UnsetType
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS, NS
 from compensator.messages import Candidate, EstimateMessage, Offset, Sample, Status
 
 #: Length of the history and of one point, ns.
-SPAN_NS = 24 * 3600 * NS
+SPAN_NS = 24 * HOUR_NS
 STEP_NS = 60 * NS
 #: A point farther ahead of the watch's clock than this is dropped, ns: clocks differ by seconds or minutes, and points
 #: ahead would never be older than a day.

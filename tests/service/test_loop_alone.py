@@ -12,14 +12,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS, NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import DiagnosisData
+from compensator.service.loop.avoided import avoid, is_avoided
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Place, decode_loop
 from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
+from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.second_opinion import described
 
 #: A planned diagnosis is 8 h later.
@@ -59,10 +61,12 @@ def decided(
     others: dict[str, Reasons],
     shift_um: float = 0.0,
     other_level_um: float = 0.0,
+    ahead: Callable[[int], int] = lambda _: 0,
 ) -> Iterator[Decided]:
     """Run a loop, until it exchanges models; diagnoses find nothing. Others are named by their first letter.
 
-    The mount of the displacement sensor has shifted Y by `shift_um`; the others are off by `other_level_um` more.
+    The mount of the displacement sensor has shifted Y by `shift_um`; the others are off by `other_level_um` more. The
+    clock is ahead by so many minutes.
     """
     noise = np.random.default_rng(1)
     for minute in range(1, round(60 * hours)):
@@ -70,11 +74,12 @@ def decided(
         y_um = 30.0 * math.sin(minute / 70.0) + effect_um + shift_um
         own, other = noise.normal(shift_um, 0.4, 2)
         other += other_level_um
-        known = {one.sha256: outcome(minute, other, y_um, others[one.sha256[0]](minute)) for one in loop.state.taken}
-        for note in loop.step(outcome(minute, effect_um + own, y_um, present(minute)), known):
+        clock, taken = minute + ahead(minute), loop.state.taken
+        known = {one.sha256: outcome(clock, other, y_um, others[one.sha256[0]](minute)) for one in taken}
+        for note in loop.step(outcome(clock, effect_um + own, y_um, present(minute)), known):
             yield Decided(minute / 60.0, note.data["step"], note.data.get("why", ""))
         if loop.state.diagnosis is not None:
-            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), BEGIN_NS + minute * 60 * NS)
+            loop.receive(DiagnosisData(verdict="adequate", effects=[], needs=""), BEGIN_NS + clock * 60 * NS)
         if loop.state.exchange:
             return
 
@@ -275,3 +280,18 @@ def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> 
     loop.model_changed(["gain:DTF"], BEGIN_NS + 1440 * 60 * NS)
     loop.step(outcome(1441, math.nan, math.nan, ()), {})
     assert loop.state.misfit_min == 0.0
+
+
+def test_what_was_shown_while_the_clock_was_ahead_counts_no_longer_and_delays_nothing_else() -> None:
+    """The first two hours by a clock that is 100 h ahead; newer parameters have taken over meanwhile."""
+    loop = loop_of(place("a"), every_h=168)
+    list(decided(loop, 2, never, {"a": never}, ahead=lambda _: 6000))
+    state, (found,) = loop.state, loop.state.found
+    future_ns = BEGIN_NS + 100 * HOUR_NS
+    found.comparison.model_ns = found.level_utc_ns = future_ns
+    avoid(state, ["gain:TDTF"], future_ns, 168.0)
+    assert found.comparison.blocks and state.error.blocks
+    assert list(decided(loop, 24, never, {"a": never}))[-1] == Decided(6.0, "adopt", "")
+    now_ns = BEGIN_NS + 6 * HOUR_NS
+    assert max(number * BLOCK_NS for number, _ in state.error.blocks) <= now_ns
+    assert not is_avoided(state, ["gain:TDTF"], now_ns + 169 * HOUR_NS)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from compensator.errors import DataError
 from compensator.messages import number
 from compensator.service.loop.job import Job, read_record
 from compensator.service.loop.record import table_of_rows, usable_table
@@ -83,3 +84,9 @@ async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(t
         assert np.array_equal(values, read.columns[name], equal_nan=True), name
     zeros = [o.sample.time_utc_ns for o in service.outcomes[50:] if any(note.kind == "zero" for note in o.notes)]
     assert len(zeros) == 1 and found.zeros_ns == zeros
+
+
+def test_a_time_without_a_sample_is_refused() -> None:
+    """The clock was set back before a diagnosis was begun again."""
+    with pytest.raises(DataError, match="record: no samples in the time that is diagnosed"):
+        usable_table([])

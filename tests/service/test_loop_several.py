@@ -401,9 +401,11 @@ async def test_an_answer_to_a_candidate_that_has_given_its_place_is_refused(tmp_
 def newer_parameters() -> Loop:
     """A loop with one candidate, and newer parameters of its effects that are warmed up."""
     loop = Loop(settings().loop, 60.0, [])
-    loop.state.found = [Place(sha256="a" * 64, effects=["gain DTF"], role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
+    effects = ["gain DTF", "input:coolant_degc"]
+    loop.state.found = [Place(sha256="a" * 64, effects=effects, role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
     loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
-    found = DiagnosisData(verdict="explained", candidate_sha256="b" * 64, effects=["gain DTF"])
+    # A diagnosis lists them by what they remove.
+    found = DiagnosisData(verdict="explained", candidate_sha256="b" * 64, effects=effects[::-1])
     assert loop.receive(found, NOW_NS) == [] and loop.state.diagnosis is not None
     return loop
 

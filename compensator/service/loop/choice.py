@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
@@ -87,7 +87,7 @@ class Choice:
         state, since_ns = self._state, now_ns - self._state.adopted_utc_ns
         if self._settings.policy != "adopt":
             return False
-        if state.adopted_utc_ns and since_ns < self._settings.shadow_h * 3600 * NS:
+        if state.adopted_utc_ns and since_ns < self._settings.shadow_h * HOUR_NS:
             return False
         return state.watched is None or not leads(state.watched.verdict, self._settings)
 

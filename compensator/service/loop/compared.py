@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
@@ -25,8 +25,6 @@ from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
 from compensator.service.transfer.comparison import Comparison, changed
 from compensator.service.transfer.second_opinion import is_unusable
-
-_HOUR_NS = 3600 * NS
 
 
 class Compared:
@@ -83,7 +81,7 @@ class Compared:
         if not found.add(present, other, suspected=False):
             return False
         hours = remembered_h(self._settings, self._place.role)
-        oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
+        oldest_ns = present.sample.time_utc_ns - round(hours * HOUR_NS)
         found.forget_before(oldest_ns, 2 * self._settings.probes)
         self.judge()
         return True
@@ -118,7 +116,7 @@ class Compared:
     def is_better(self, now_ns: int) -> bool:
         """Return whether a candidate has shown enough, and in its own hours, too."""
         place = self._place
-        compared_h = (now_ns - place.since_utc_ns) / _HOUR_NS
+        compared_h = (now_ns - place.since_utc_ns) / HOUR_NS
         found = is_clearly_better(place.verdict) and is_enough(
             place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
         )

@@ -84,7 +84,7 @@ class ModelLoop:
         for sha256, files in shadow_files(self.state).items():
             if not attachments.keys() >= set(files):
                 raise DataError(f"loop.json names a model in shadow, but {' or '.join(files)} is missing")
-            self.shadows[sha256] = Shadow.of(config, *(attachments[file] for file in files))
+            self.shadows[sha256] = Shadow.of(config, *(attachments[file] for file in files), source=files[0])
 
     @property
     def state(self) -> LoopState:

@@ -11,7 +11,7 @@ from compensator.events import Note
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, withdraw
-from compensator.service.loop.state import Exchange, LoopState, Place
+from compensator.service.loop.state import Exchange, LoopState, Place, same_effects
 
 
 def decide_exchange(
@@ -67,7 +67,7 @@ def exchanged(
     state.adopted_utc_ns = now_ns
     outgoing = Place(sha256=sha256_before, effects=before, role="before", since_utc_ns=now_ns)
     watched = state.watched
-    if watched is not None and sorted(before) == sorted(incoming.effects):
+    if watched is not None and same_effects(before, incoming.effects):
         # Other parameters of the same effects end with the same effect: it stays the way back.
         watched.begin_anew()
         watched.since_utc_ns = now_ns

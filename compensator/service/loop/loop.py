@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import DiagnosisData, LoopAction, Note
@@ -34,9 +34,9 @@ from compensator.service.loop.place import (
     with_effects,
 )
 from compensator.service.loop.proof import is_better_to_go_back_to, is_limited
-from compensator.service.loop.schedule import begin_again, begin_if_due, forget_future, pass_planned
+from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.state import LoopState, Place, Running, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -53,7 +53,6 @@ from compensator.service.transfer.second_opinion import described
 #: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
 #: and a candidate ends that has been at a limit for so long, min.
 CLEAN_MIN = BLOCK_MIN
-_HOUR_NS = 3600 * NS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,12 +121,12 @@ class Loop:
         """
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
         minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
-        forget_future(state, now_ns)
+        state.forget_future(now_ns, avoided_h=self._settings.watch_h)
         all_suspect = bool(others) and all_suspect_a_sensor([present, *others.values()])
         suspected = contradicted or (all_suspect and not any(is_constant(place.error.blocks) for place in state.taken))
         state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
-        record_ns = round(self._settings.record_h * _HOUR_NS)
+        record_ns = round(self._settings.record_h * HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         state.error.update(present)
         if sets_zero(present):
@@ -169,7 +168,6 @@ class Loop:
         It is over when decisions are made again: a suspicion that comes and goes lets nothing be compared either.
         """
         state, before_min, longest_min = self.state, self.state.uncompared_min, 60.0 * self._settings.shadow_h
-        state.uncompared_ns = min(state.uncompared_ns, present.sample.time_utc_ns)
         if others and (is_suspected or (before_min and state.clean_min < CLEAN_MIN)):
             state.uncompared_ns = state.uncompared_ns or present.sample.time_utc_ns
             state.uncompared_min += self._period_s / 60.0 if is_suspected else 0.0
@@ -186,7 +184,7 @@ class Loop:
         is_candidate = place.role == "candidate"
         if is_candidate and place.limited_min >= CLEAN_MIN:
             return end(self.state, place, "limits")
-        if now_ns - place.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
+        if now_ns - place.since_utc_ns >= self._settings.watch_h * HOUR_NS:
             unshown = "no_answer" if place.is_proposed else "no_difference"
             return end(self.state, place, unshown if is_candidate else "watched")
         if self.state.clean_min < CLEAN_MIN or not is_judged:
@@ -261,7 +259,7 @@ class Loop:
         Where an effect begins in a record, it may look like a step or a drift of Y until there is more of it. What had
         moved before the last zero is in that zero.
         """
-        half_ns = round(0.5 * self._settings.record_h * _HOUR_NS)
+        half_ns = round(0.5 * self._settings.record_h * HOUR_NS)
         if found.y_moved_utc_ns > self.state.zero_utc_ns:
             self.state.y_drifted_ns = running.to_utc_ns
         elif found.verdict == "explained" and running.from_utc_ns <= self.state.y_drifted_ns - half_ns:
@@ -345,7 +343,8 @@ class Loop:
             return []
         avoid(self.state, candidate.effects, now_ns, self._settings.watch_h)
         running, notes = self.state.diagnosis, end(self.state, candidate, "dismissed")
-        if running is not None and running.found is not None and running.found.effects == candidate.effects:
+        found = running.found if running is not None else None
+        if found is not None and same_effects(found.effects, candidate.effects):
             notes += end_diagnosis(self.state, "dismissed")  # newer parameters of them are refused, too
         return notes
 

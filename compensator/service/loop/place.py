@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART, CANDIDATES
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place
+from compensator.service.loop.state import LoopState, Place, same_effects
 
 #: A model is better so far if it has shown this part of the deviations that it must show.
 LEADS = 0.5
@@ -29,7 +29,6 @@ _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 _YOUNG = 1.25
 #: A candidate has had the time to be judged after so many times `shadow_h`.
 _HAS_TIME = 2.0
-_HOUR_NS = 3600 * NS
 
 
 def remembered_h(settings: LoopSettings, role: Role) -> float:
@@ -60,14 +59,14 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
     before = with_effects(state, role, found.effects)
     if before is not None:
         # What gave its place too often would never be judged by its own hours.
-        is_young = now_ns - before.since_utc_ns < _YOUNG * settings.shadow_h * _HOUR_NS
+        is_young = now_ns - before.since_utc_ns < _YOUNG * settings.shadow_h * HOUR_NS
         return "in_shadow" if is_young or is_asked(before, settings) else ""
     return "waits" if state.exchange else ""
 
 
 def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place | None:
     """Return the candidate with the effects of another one, which then goes on with its comparison."""
-    alike = [place for place in state.candidates if sorted(place.effects) == sorted(effects)]
+    alike = [place for place in state.candidates if same_effects(place.effects, effects)]
     return alike[0] if alike and role == "candidate" and not state.exchange else None
 
 
@@ -82,7 +81,7 @@ def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | 
         return None
 
     def is_new(place: Place) -> bool:
-        has_time = now_ns - place.since_utc_ns >= _HAS_TIME * settings.shadow_h * _HOUR_NS
+        has_time = now_ns - place.since_utc_ns >= _HAS_TIME * settings.shadow_h * HOUR_NS
         return place.verdict.hours < settings.shadow_h and not has_time
 
     return min(

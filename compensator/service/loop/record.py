@@ -22,6 +22,7 @@ from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.data.screening import dead_part
 from compensator.data.table import Table
+from compensator.errors import DataError
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.service.loop.trust import is_contradicted, is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
@@ -67,7 +68,14 @@ def table_of_rows(
         Name in messages.
     zeros_ns : sequence of int
         Times of the samples with which a zero was set, ns since 1970 UTC, in order.
+
+    Raises
+    ------
+    DataError
+        If there is no sample.
     """
+    if not rows:
+        raise DataError(f"{name}: no samples in the time that is diagnosed")
     names = dict.fromkeys(channel for sample, _ in rows for channel in sample.channels)
     t_s = np.array([sample.time_utc_ns / NS for sample, _ in rows])
     columns = {channel: np.array([_mean(sample, channel) for sample, _ in rows], dtype=np.float64) for channel in names}

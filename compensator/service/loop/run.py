@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
@@ -236,9 +236,9 @@ class LoopRun:
         elif sets_zero(outcome):
             self._warm_ns = outcome.sample.time_utc_ns
         warm_up_h = WARM_UP * self._compensation.slowest_min / 60.0
-        oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * 3600 * NS)
+        oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * HOUR_NS)
         if self._warm_ns:
             # The deformation counts from what the model predicts at that zero, so its state must be known there.
-            oldest_ns = min(oldest_ns, self._warm_ns - round(warm_up_h * 3600 * NS))
+            oldest_ns = min(oldest_ns, self._warm_ns - round(warm_up_h * HOUR_NS))
         while self._record[0].sample.time_utc_ns <= oldest_ns:
             self._record.popleft()

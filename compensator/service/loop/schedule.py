@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from compensator.clock import NS
+from compensator.clock import HOUR_NS, NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.ending import end_diagnosis
 from compensator.service.loop.state import LoopState, Running
 
-_HOUR_NS = 3600 * NS
-
-
-def forget_future(state: LoopState, now_ns: int) -> None:
-    """Let nothing have happened after now: the clock was ahead, and was set back."""
-    state.diagnosed_utc_ns = min(state.diagnosed_utc_ns, now_ns)
-    state.adopted_utc_ns = min(state.adopted_utc_ns, now_ns)
-    state.zero_utc_ns = min(state.zero_utc_ns, now_ns)
-    for place in state.taken:
-        place.since_utc_ns = min(place.since_utc_ns, now_ns)
-
 
 def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
     """Return the last planned time, ns since 1970 UTC; at the first sample it counts as done."""
-    at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
+    at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * HOUR_NS
     planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
     # One after the last planned time was made while the clock was ahead.
     state.planned_utc_ns = min(state.planned_utc_ns or planned_ns, planned_ns)
@@ -43,7 +32,7 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
     else:
         return []
     state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
-    from_ns = now_ns - round(settings.record_h * _HOUR_NS)
+    from_ns = now_ns - round(settings.record_h * HOUR_NS)
     state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
     return [_begins(state.diagnosis)]
 
@@ -64,7 +53,7 @@ def begin_again(state: LoopState) -> list[Note]:
 
 
 def _begins(running: Running) -> Note:
-    text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / _HOUR_NS:g} h begins"
+    text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / HOUR_NS:g} h begins"
     if running.why == "misfit":
         text += ": measured and predicted Y have diverged"
     data = LoopData(

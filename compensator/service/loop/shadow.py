@@ -36,15 +36,15 @@ class Shadow:
     data: bytes
 
     @classmethod
-    def of(cls, config: Config, data: bytes, state: bytes) -> Shadow:
-        """Return the shadow of a recording, from its model file and state.
+    def of(cls, config: Config, data: bytes, state: bytes, *, source: str) -> Shadow:
+        """Return the shadow of a recording, from its model file, whose name is `source`, and state.
 
         Raises
         ------
         CompensatorError
             If they cannot be used with the configuration.
         """
-        compensation = Compensation(config, model_of(config, data, source="candidate.toml"))
+        compensation = Compensation(config, model_of(config, data, source=source))
         compensation.restore(state)
         return cls(compensation, data)
 

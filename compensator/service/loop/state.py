@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 
+from compensator.clock import HOUR_NS
 from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.messages import UNREADABLE, check_numbers
@@ -20,6 +22,11 @@ Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
 #: Before the first value.
 NO_VERDICT = ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=NotJudged.NOT_YET)
+
+
+def same_effects(a: Sequence[str], b: Sequence[str]) -> bool:
+    """Return whether two models have the same effects: a diagnosis lists them by what they remove, so in any order."""
+    return sorted(a) == sorted(b)
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
@@ -176,6 +183,33 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def place(self, sha256: str) -> Place | None:
         """Return the model in shadow with a hash."""
         return next((place for place in self.taken if place.sha256 == sha256), None)
+
+    def forget_future(self, now_ns: int, *, avoided_h: float) -> None:
+        """Let nothing have happened after now: the clock was ahead, and was set back.
+
+        Parameters
+        ----------
+        now_ns : int
+            Now, ns since 1970 UTC.
+        avoided_h : float
+            For how long effects are avoided at most, h.
+        """
+        self.diagnosed_utc_ns = min(self.diagnosed_utc_ns, now_ns)
+        self.adopted_utc_ns = min(self.adopted_utc_ns, now_ns)
+        self.zero_utc_ns = min(self.zero_utc_ns, now_ns)
+        self.y_drifted_ns = min(self.y_drifted_ns, now_ns)
+        self.uncompared_ns = min(self.uncompared_ns, now_ns)
+        self.probes_shown = [one for one in self.probes_shown if one[0] <= now_ns]
+        longest_ns = now_ns + round(avoided_h * HOUR_NS)
+        self.avoided = [
+            msgspec.structs.replace(one, until_utc_ns=min(one.until_utc_ns, longest_ns)) for one in self.avoided
+        ]
+        self.error.forget_after(now_ns)
+        for place in self.taken:
+            place.since_utc_ns = min(place.since_utc_ns, now_ns)
+            place.level_utc_ns = min(place.level_utc_ns, now_ns)
+            place.comparison.forget_after(now_ns)
+            place.error.forget_after(now_ns)
 
     def remove(self, place: Place) -> None:
         """Let a model go."""

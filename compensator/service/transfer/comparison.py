@@ -15,7 +15,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.axes import FIRST
-from compensator.clock import NS
+from compensator.clock import HOUR_NS, NS
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.messages import number
 from compensator.messages_axes import AxesEstimate
@@ -104,6 +104,17 @@ class ComparisonState(msgspec.Struct, kw_only=True):
     still: int = 0
     y_um: float | None = None
     model_ns: int = 0
+
+    def forget_after(self, time_utc_ns: int) -> None:
+        """Forget what is later than a time, ns since 1970 UTC: the clock was ahead."""
+        if self.last_ns <= time_utc_ns:
+            return
+        last = time_utc_ns // BLOCK_NS
+        self.blocks = [block for block in self.blocks if block.number <= last]
+        self.rows = self.rows if self.number <= last else []
+        self.probes = [probe for probe in self.probes if probe.time_utc_ns <= time_utc_ns]
+        self.first_ns, self.last_ns = min(self.first_ns, time_utc_ns), time_utc_ns
+        self.model_ns = min(self.model_ns, time_utc_ns)
 
 
 class Comparison:
@@ -203,7 +214,7 @@ class Comparison:
         """
         by_sensor = self._by_sensor(deviations)
         chosen = by_sensor if by_sensor.why is None or not self.state.probes else self._by_probes(deviations)
-        hours = (self.state.last_ns - self.state.first_ns) / (3600 * NS)
+        hours = (self.state.last_ns - self.state.first_ns) / HOUR_NS
         return changed(chosen, hours=hours)
 
     def of_itself(self) -> Comparison:

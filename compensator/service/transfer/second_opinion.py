@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from compensator.axes import FIRST, AxisWords, label_of
-from compensator.clock import NS
+from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ServiceError
@@ -57,7 +57,7 @@ def second_opinion(
     """
     try:
         slowest = max(slowest_min(model) for model in (present, candidate))
-        compared_ns = round(COMPARED_H * 3600 * NS)
+        compared_ns = round(COMPARED_H * HOUR_NS)
         window = window_of(folder, config.machine.name, slowest, between_samples, compared_ns=compared_ns)
         runs = [RecordedRun(config, Compensation(config, model), probes=True) for model in (present, candidate)]
         found, moves_um = _run(runs, window, window.end_ns - compared_ns, between_samples)
@@ -66,7 +66,7 @@ def second_opinion(
     verdicts = {}
     for axis, comparison in found.items():
         first_ns = comparison.state.first_ns
-        hours = (window.end_ns - first_ns) / (3600 * NS) if first_ns else 0.0
+        hours = (window.end_ns - first_ns) / HOUR_NS if first_ns else 0.0
         verdicts[axis] = changed(comparison.verdict(), hours=hours, ratio=None, offset_change_um=moves_um.get(axis))
     own = verdicts.pop(FIRST)
     return changed(own, axes=verdicts)
