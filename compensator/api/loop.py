@@ -31,8 +31,6 @@ from compensator.service.outcome import Outcome
 #: Effects by which measured Y moves by itself: it goes on, or happened once.
 _DRIFT, _STEP = "drift", "step"
 
-#: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing, or nothing that is deployed.
-SHORTEST_H, FEWEST_PROBES = SHORT_H, 12
 #: An end must leave less than this part of what a longer part does.
 END_IS_BETTER = 0.7
 
@@ -90,7 +88,7 @@ def diagnoses_of_table(table: Table, model: bytes, *, probe_std_um: float | None
             break
         try:
             last = Part.of(end, base, probe_std_um)
-        except CompensatorError:  # too little data in so short an end
+        except CompensatorError:  # too little measured Y in so short an end
             break
         if last.found.diagnosis.shows_nothing:
             # An end in which little moves shows no effect either: it has ended only if the model is better without it.
@@ -158,10 +156,10 @@ class Part:
 
 
 def _end_of(table: Table, from_s: float) -> Table | None:
-    """Return the end of a table; None if it is too short, or is all of it."""
-    kept = table.t_s >= min(from_s, table.t_s.max() - 3600.0 * SHORTEST_H)
+    """Return the end of a table, not too short to be deployed from; None if it is all of it."""
+    kept = table.t_s >= min(from_s, table.t_s.max() - 3600.0 * SHORT_H)
     columns = {name: values[kept] for name, values in table.columns.items()}
-    if kept.all() or (is_probed(table) and np.sum(np.isfinite(columns["y_um"])) < FEWEST_PROBES):
+    if kept.all():
         return None
     return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
 

@@ -19,6 +19,7 @@ from compensator.blas import one_thread_from_start
 one_thread_from_start()
 
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result, read_job  # noqa: E402
+from compensator.service.loop.weighing import FAILED  # noqa: E402
 
 #: Priority of the process.
 NICENESS = 10
@@ -36,9 +37,9 @@ def main() -> int:
     from compensator.errors import CompensatorError
 
     try:
-        result = _diagnose(job, folder) if not why else Result(verdict="failed", needs=why)
+        result = _diagnose(job, folder) if not why else Result(verdict=FAILED, needs=why)
     except CompensatorError as error:
-        result = Result(verdict="failed", needs=str(error))
+        result = Result(verdict=FAILED, needs=str(error))
     result.write(folder / RESULT)
     return 0
 

@@ -19,8 +19,10 @@ from compensator.diagnose.deciding import DECIDES, Deciding, PlannedTest
 from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
-from compensator.diagnose.nearest import AT, TEMPERATURE, Near, acts_by_temperature, course_evidence, nearest
+from compensator.diagnose.nearest import Near, course_evidence, may_be_near_the_cause, nearest
 from compensator.diagnose.trials import Trials
+from compensator.model.effects.hypothesis import DEGC
+from compensator.model.effects.regression import AMBIENT
 from compensator.model.effects.seen import roughly
 from compensator.model.effects.unobserved import Unobserved
 
@@ -134,7 +136,7 @@ def advice_of(
     fit = found.selection.fit
     unexplained = _unexplained(found, explained_pct=explained_pct, is_explained=is_explained)
     near: tuple[Near, ...] = ()
-    if unexplained is not None or between_rivals or any(map(acts_by_temperature, fit.terms)):
+    if unexplained is not None or between_rivals or any(map(may_be_near_the_cause, fit.terms)):
         near = nearest(fit, found.selection.before.rest)[:LISTED]
     # A test that decides comes before one that would not.
     tests = sorted(between_rivals, key=lambda test: not test.decides)
@@ -172,7 +174,7 @@ def _unexplained(found: Findings, *, explained_pct: float | None, is_explained: 
         course = found.remainder.added - found.own_paths
         return _described("remainder", found, course, _memory_min(course, evidence.context.period_min), [])
     if not is_explained:
-        course = evidence.left(evidence.residual, found.whole + found.left_in_um, at_rest=False) * evidence.used
+        course = evidence.left(found.whole + found.left_in_um) * evidence.used
         left = _described("residual", found, course, fit.rest.tau_min, [])
         return left if left.rms_um > 0.0 else None
     return None
@@ -226,7 +228,7 @@ def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
     if not alike:
         return f"Place the next sensor {where}; no logged channel resembles it."
     first = alike[0]
-    if first.lag_min < 0.0 and not first.channel.endswith(TEMPERATURE):
+    if first.lag_min < 0.0 and not first.channel.endswith(DEGC):
         # A speed or a switch follows nothing: it is commanded.
         return f"Place the next sensor {where}; it acts before {first.channel} changes."
     if first.lag_min < 0.0:
@@ -278,4 +280,4 @@ def _driver(term: Term, trials: Trials) -> str:
     _, path, channel = term.hypothesis.place
     if channel:
         return trials.mover(channel)
-    return {"DTF": trials.heating, "TTF": trials.heating, "TDTF": AT}.get(path, "")
+    return {"DTF": trials.heating, "TTF": trials.heating, "TDTF": AMBIENT}.get(path, "")

@@ -15,9 +15,11 @@ from compensator.arrays import Vector
 BLOCK_MIN, FEWEST = 30.0, 8
 #: A split must be better by so much log-likelihood.
 CHANGED = 5.0
+#: A model was right before if its error varied by less than this part of what it has varied by since.
+QUIET = 0.5
 
 
-def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: float | None = None) -> float | None:
+def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, from_quiet: bool = False) -> float | None:
     """Return when a residual has changed, s; None if it has not.
 
     Parameters
@@ -26,8 +28,8 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: floa
         Time, and residual, µm; NaN where it is unknown.
     floor_um : float
         A standard deviation that does not matter, µm.
-    quiet : float, optional
-        The residual must have varied by no more than this part of what it varies by since.
+    from_quiet : bool
+        Whether the model must have been right before (`QUIET`).
 
     Examples
     --------
@@ -48,7 +50,7 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, quiet: floa
 
     gains = [
         cost(means) - cost(means[:split]) - cost(means[split:])
-        if quiet is None or np.std(means[:split]) <= quiet * np.std(means[split:])
+        if not from_quiet or np.std(means[:split]) <= QUIET * np.std(means[split:])
         else 0.0
         for split in splits
     ]

@@ -118,9 +118,7 @@ def deployment_of(
     return dataclasses.replace(decided, effects=_not_replaced(decided.effects)) if decided.is_refused else decided
 
 
-def _decided(
-    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float = CONTRADICTS
-) -> Deployment:
+def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float) -> Deployment:
     return Deployment(
         found=found,
         effects=effects,
@@ -195,7 +193,7 @@ def _as_far_as_confirmed(
     return found, effects, dataclasses.replace(held_out, whole=whole)
 
 
-def _by_channels(decided: Deployment, contradicts: float = CONTRADICTS) -> Deployment | None:
+def _by_channels(decided: Deployment, contradicts: float) -> Deployment | None:
     """Deploy all channels in the place of useless names, of a source, or of none, where the data clearly confirm it."""
     # Paths that were fitted anew would stay, and they are what is contradicted.
     is_refuted = decided.contradicted and not decided.found.search.evidence.free_paths
@@ -239,17 +237,17 @@ def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: Held
         return None
     if not (found.terms and found.explains) or evidence.free_paths:
         return hours
-    left = evidence.left(evidence.residual, found.named, at_rest=False)[evidence.used]
+    left = evidence.left(found.named)[evidence.used]
     is_confirmed = rms_of(held_out.whole) < rms_of(held_out.nothing)
     is_known = is_confirmed and not any(effect.hardly_determined for effect in effects)
     return None if is_known or evidence.noise.is_explained(float(left @ left)) else hours
 
 
 def _hours(found: Findings) -> float:
-    """Return the time from the first to the last measured Y of all runs, h."""
-    evidence = found.search.evidence
+    """Return the time from the first to the last measured Y of all runs, both samples whole, h."""
+    evidence, period_s = found.search.evidence, found.search.evidence.model.period_s
     seen = [run.t_s[evidence.used[part]] for run, part in zip(evidence.runs, evidence.samples_of_runs(), strict=True)]
-    return sum(float(np.ptp(t_s)) for t_s in seen if t_s.size) / 3600.0
+    return sum(float(np.ptp(t_s)) + period_s for t_s in seen if t_s.size) / 3600.0
 
 
 def _not_replaced(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:

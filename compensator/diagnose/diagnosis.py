@@ -29,7 +29,7 @@ from compensator.diagnose.found_effect import FoundEffect, described, no_further
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
 from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.points import Points
@@ -43,9 +43,6 @@ from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import LEAST_OWN_ERROR, ThermalModel
 from compensator.progress import ExecutorMap, Progress, after, unreported
-
-#: A base whose own calibration left more than this share of the deformation's spread lacks something.
-FAR_OFF = 0.1
 
 
 def diagnose(
@@ -171,7 +168,7 @@ def _diagnosed(
         advice = advice_of(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
         )
-    left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
         effects,
@@ -193,7 +190,7 @@ def _diagnosed(
         residual_after=np.where(evidence.used, left, np.nan),
         paths_um=found.own_paths - found.paths,
         remainder_um=found.whole - found.named,
-        named_rms_um=rms_of(evidence.left(evidence.residual, found.named, at_rest=False)[evidence.used]),
+        named_rms_um=rms_of(evidence.left(found.named)[evidence.used]),
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
@@ -240,12 +237,10 @@ def _evidence(
 
 
 def _is_far_off(evidence: Evidence) -> bool:
-    # The noise of a calibration says nothing about its paths.
-    own_um2 = (evidence.model.held_out_rms_um or 0.0) ** 2 - evidence.noise.noise_um**2
-    return own_um2 > (FAR_OFF * evidence.spread_um) ** 2
+    return is_far_off(evidence.model, evidence.noise.noise_um, evidence.spread_um)
 
 
-def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off: bool = False) -> list[Remark]:
+def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off: bool) -> list[Remark]:
     """Return the remark that paths were kept which would be fitted anew, where something is missing."""
     if verdict == "adequate" or (evidence.free_paths and deployed) or not _is_far_off(evidence):
         return []
@@ -463,7 +458,7 @@ def _verdict(
     noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
 
     def leaves_noise(added: Vector) -> bool:
-        left = evidence.left(evidence.residual, added, at_rest=False)[evidence.used]
+        left = evidence.left(added)[evidence.used]
         return noise.is_explained(float(left @ left))
 
     is_noise = leaves_noise(found.whole + found.left_in_um)

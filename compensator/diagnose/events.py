@@ -147,7 +147,7 @@ def follows_day(evidence: Evidence, course: Vector) -> bool:
     return bool(np.var(left) < (1.0 - DAILY) * np.var(centred))
 
 
-def steepest(evidence: Evidence, course: Vector, count: int = 12) -> list[Time]:
+def steepest(evidence: Evidence, course: Vector, count: int) -> list[Time]:
     """Return when a course that is no switching moves fastest: record and time, min, apart from each other."""
     found: list[tuple[float, Time]] = []
     period_min = evidence.context.period_min

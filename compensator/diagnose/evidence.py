@@ -221,17 +221,17 @@ class Evidence:
         residual = np.where(self.used, self.residual - added, 0.0)
         return dataclasses.replace(self, model=model, signals=signals, residual=residual), added
 
-    def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
-        """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
+    def left(self, added: Vector, *, at_rest: bool = False) -> Vector:
+        """Return the residual less effects and less the nuisances as the samples used know them, on every sample.
 
         Parameters
         ----------
-        raw, effects : numpy.ndarray, shape (n,)
-            Residual of the base model, and what is subtracted from it, µm.
+        added : numpy.ndarray, shape (n,)
+            What effects add to Y, µm.
         at_rest : bool
             Whether only the zero of each run is unknown, and not its initial state.
         """
-        open_ = raw - effects
+        open_ = self.residual - added
         table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         return np.asarray(open_ - table @ coefficients)

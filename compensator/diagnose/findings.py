@@ -359,7 +359,7 @@ def in_free_run(found: Findings) -> tuple[float, float]:
     at_rest = all(signals.initial_um is None for signals in evidence.signals)
 
     def left_um(added: Vector) -> float:
-        left = evidence.left(evidence.residual - of_time, added, at_rest=at_rest)[evidence.used]
+        left = evidence.left(added + of_time, at_rest=at_rest)[evidence.used]
         return float(np.sqrt(np.mean(left**2)))
 
     return left_um(by_base(evidence)), left_um(found.whole - hidden - of_time)

@@ -19,22 +19,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Matrix, Vector
+from compensator.diagnose.background import LAGS_MIN, RECENT_MIN
 from compensator.diagnose.fit import Fit, Term, fit_terms
 from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
 from compensator.diagnose.points import Points, Rest
 from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.hypothesis import DEGC
+from compensator.model.effects.regression import AMBIENT
 from compensator.model.effects.signals import RecordSignals
 
-#: Lags behind a channel, and ahead of it, min.
-BEHIND_MIN, AHEAD_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), (4.0, 12.0, 35.0)
 #: Sizes of a channel's gains that are tried, as shares of the deformation's spread.
 SIZES = np.geomspace(0.01, 3.0, 6)
 #: How many of the nearest channels are run backwards to see what is chance, and where each begins, as shares.
 CHECKED, BEGINNINGS = 5, (0.0, 0.17, 0.33, 0.5, 0.67, 0.83)
-#: Names of the base's own temperatures among the channels.
-T_Q, AT = "t_q_degc", "at_degc"
-#: A channel of this ending is a temperature.
-TEMPERATURE = "_degc"
+#: Name of the base's own temperature of the heat source among the channels; that of the ambient is `AMBIENT`.
+T_Q = "t_q_degc"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,10 +60,10 @@ class Near:
     by_chance: float = 0.0
 
 
-def acts_by_temperature(term: Term) -> bool:
+def may_be_near_the_cause(term: Term) -> bool:
     """Return whether an effect acts by a temperature: that of a channel, or those that drive the base's paths."""
     _, path, channel = term.hypothesis.place
-    return channel.endswith(TEMPERATURE) if channel else bool(path)
+    return channel.endswith(DEGC) if channel else bool(path)
 
 
 def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
@@ -84,7 +83,7 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     """
     observed = [term for term in fit.terms if term.hypothesis.effect.observed]
     if len(observed) == len(fit.terms):
-        observed = [term for term in observed if not acts_by_temperature(term)]
+        observed = [term for term in observed if not may_be_near_the_cause(term)]
     base = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
     ranking = _Ranking(base, unexplained)
     points = fit.likelihood.points
@@ -92,11 +91,11 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     found = [ranking.of(name, _columns(points, values)) for name, values in signals.items()]
     found = sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence)
     backwards = [
-        ranking.of("", _columns(points, [np.roll(u[::-1], round(share * u.size)) for u in signals[near.channel]]))
+        ranking.evidence(_columns(points, [np.roll(u[::-1], round(share * u.size)) for u in signals[near.channel]]))
         for near in found[:CHECKED]
         for share in BEGINNINGS
     ]
-    by_chance = max((near.evidence for near in backwards), default=0.0)
+    by_chance = max(backwards, default=0.0)
     return tuple(dataclasses.replace(near, by_chance=by_chance) for near in found)
 
 
@@ -115,7 +114,7 @@ def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
     observed = [t.start for t in fit.terms if t.hypothesis.effect.observed]
     base = fit_terms(fit.likelihood, observed, evaluations=1)
     points = fit.likelihood.points
-    return _Ranking(base, unexplained).of("", _unit(points, points.averaged(course[:, None]))).evidence
+    return _Ranking(base, unexplained).evidence(_unit(points, points.averaged(course[:, None])))
 
 
 class _Ranking:
@@ -135,30 +134,38 @@ class _Ranking:
 
     def of(self, name: str, columns: Matrix) -> Near:
         """Return how near a channel comes, given what it would be behind and ahead of all lags."""
-        white = self._likelihood.projected(columns * self._points.spread_um)
+        white = self._whitened(columns)
+        return Near(channel=name, evidence=self._added(white), lag_min=_single_lag(white, self._target))
+
+    def evidence(self, columns: Matrix) -> float:
+        """Return what columns of any kind add to the evidence."""
+        return self._added(self._whitened(columns))
+
+    def _whitened(self, columns: Matrix) -> Matrix:
+        return self._likelihood.projected(columns * self._points.spread_um)
+
+    def _added(self, white: Matrix) -> float:
         sizes = (SIZES / math.sqrt(white.shape[1])).tolist()
         tables = [np.column_stack([self._kept, white * size]) for size in sizes]
-        best = min(RandomColumns(table, self._target).surprise for table in tables)
-        return Near(channel=name, evidence=self._alone - best, lag_min=_single_lag(white, self._target))
+        return self._alone - min(RandomColumns(table, self._target).surprise for table in tables)
 
 
 def _single_lag(white: Matrix, target: Vector) -> float:
     """Return the lag of the one column that explains most, min; negative ahead of the channel."""
     squares = np.einsum("ij,ij->j", white, white)
     gains = (white.T @ target) ** 2 / (1.0 + squares)
-    lags = (*BEHIND_MIN, *(-lag for lag in AHEAD_MIN))
-    return float(lags[int(np.argmax(gains))]) if white.shape[1] == len(lags) else 0.0
+    return (*LAGS_MIN, *(-lag for lag in RECENT_MIN[1:]))[int(np.argmax(gains))]
 
 
 def _signals(points: Points) -> dict[str, list[Vector]]:
     """Return every channel over the records, the base's own temperatures among them."""
     evidence = points.evidence
     names = list(evidence.context.channels)
-    names += [T_Q, *([AT] if evidence.context.has_ambient else [])]
+    names += [T_Q, *([AMBIENT] if evidence.context.has_ambient else [])]
     references = [run.difference_k + run.ambient_k for run in evidence.runs]
 
     def signal(name: str, record: RecordSignals, t_q_k: Vector) -> Vector:
-        return t_q_k if name == T_Q else record.ambient_k if name == AT else record.channels[name]
+        return t_q_k if name == T_Q else record.ambient_k if name == AMBIENT else record.channels[name]
 
     records = list(zip(evidence.signals, references, strict=True))
     return {name: [signal(name, record, t_q_k) for record, t_q_k in records] for name in names}
@@ -171,8 +178,8 @@ def _columns(points: Points, values: Sequence[Vector]) -> Matrix:
 
 def _bank(values: Sequence[Vector], period_min: float) -> Matrix:
     """Return the lags behind a channel and ahead of it over several records, shape (n, lags)."""
-    behind = FilterBank(BEHIND_MIN, [(1.0,) * len(BEHIND_MIN)], period_min)
-    ahead = FilterBank(AHEAD_MIN, [(1.0,) * len(AHEAD_MIN)], period_min)
+    behind = FilterBank(LAGS_MIN, [(1.0,) * len(LAGS_MIN)], period_min)
+    ahead = FilterBank(RECENT_MIN[1:], [(1.0,) * len(RECENT_MIN[1:])], period_min)
     parts = [np.column_stack([behind.columns(u - u[0]), ahead.columns((u - u[-1])[::-1])[::-1]]) for u in values]
     return np.concatenate(parts)
 

@@ -16,7 +16,8 @@ from compensator.arrays import Vector
 from compensator.data.runs import Run, noise_of
 from compensator.model.thermal_model import ThermalModel
 
-#: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
+#: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation. One whose
+#: calibration missed by more lacks something.
 OWN_SHARE = 0.1
 #: The base model's own error may leave this many times as much.
 OWN_TIMES = 1.3
@@ -75,12 +76,18 @@ class NoiseTest:
 
 
 def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:
-    """Return the base model's own error from its calibration, less the noise, µm rms.
+    """Return the base model's own error from its calibration, less the noise, µm rms, as far as one is granted."""
+    return min(_missed_um(model, noise_um), OWN_SHARE * spread_um)
 
-    A calibration that misses by more than a share of the spread of the deformation lacks something.
-    """
-    own = float(np.sqrt(max((model.held_out_rms_um or 0.0) ** 2 - noise_um**2, 0.0)))
-    return min(own, OWN_SHARE * spread_um)
+
+def is_far_off(model: ThermalModel, noise_um: float, spread_um: float) -> bool:
+    """Return whether a calibration missed by more than is granted: it lacks something."""
+    return _missed_um(model, noise_um) > OWN_SHARE * spread_um
+
+
+def _missed_um(model: ThermalModel, noise_um: float) -> float:
+    # The noise of a calibration says nothing about its paths.
+    return float(np.sqrt(max((model.held_out_rms_um or 0.0) ** 2 - noise_um**2, 0.0)))
 
 
 def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:

@@ -23,8 +23,6 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.outcome import Diagnosis
 from compensator.model.effects.passing import Periodic
 
-#: The model was right before if its error varied by less than this part of what it has varied by since.
-QUIET = 0.5
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
 #: The time since then must leave less than this part of what all data do.
@@ -62,7 +60,7 @@ def onset_in(found: Diagnosis) -> Onset | None:
         return None
     (run,) = evidence.runs
     error = np.where(evidence.used, evidence.residual, np.nan)
-    at_s = changed_at(run.t_s, error, found.noise_floor_um, quiet=QUIET)
+    at_s = changed_at(run.t_s, error, found.noise_floor_um, from_quiet=True)
     if at_s is None:
         return None
     # It began at any time of a block, which would look like a step.

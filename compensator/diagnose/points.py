@@ -364,5 +364,4 @@ def _means(used: Mask, first: Indices, kept: Mask) -> csr_array:
 
 def lags_of_paths(context: Context) -> tuple[float, ...]:
     """Return lags that any linear path is made of, min."""
-    longest = min(600.0, max(context.minutes / 3.0, 20.0 * context.period_min))
-    return (0.0, *np.geomspace(context.period_min, longest, OWN_LAGS).tolist())
+    return (0.0, *context.lags_min(OWN_LAGS))

@@ -127,7 +127,7 @@ class Search:
             grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
             best = self._pruned(grown)
         # What was left out as too small must not come back in the place of what it was too small beside.
-        best = self._with_simpler_name(self._exchanged(best, len(best.terms), apart_from=grown.places - best.places))
+        best = self._with_simpler_name(self._exchanged(best, keep_last=False, apart_from=grown.places - best.places))
         if hidden := self._hidden(undecided, best):
             best = hidden
         return Selection(
@@ -261,19 +261,19 @@ class Search:
         ]
         return max(fits, key=lambda one: one.log_evidence).terms[-1].start
 
-    def _exchanged(self, fit: Fit, count: int | None = None, *, apart_from: frozenset[Place] = frozenset()) -> Fit:
+    def _exchanged(self, fit: Fit, *, keep_last: bool = True, apart_from: frozenset[Place] = frozenset()) -> Fit:
         """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.
 
         Parameters
         ----------
         fit : Fit
             Effects.
-        count : int, optional
-            How many effects are tried; by default all but the last, which was chosen beside the others.
+        keep_last : bool
+            Whether the last one is not tried, which was chosen beside the others.
         apart_from : frozenset of Place
             Effects that are not looked for.
         """
-        for i in range(min(len(fit.terms), len(fit.terms) - 1 if count is None else count)):
+        for i in range(len(fit.terms) - keep_last):
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from)
             forms = [one for one in proposed if one.places == fit.places and one.forms != fit.forms]
@@ -298,7 +298,10 @@ class Search:
         return fit
 
     def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
-        """Yield a source that no channel shows, where it may compete with the effects found."""
+        """Yield a source that no channel shows, where it may compete with the effects found.
+
+        It begins when `found` has the effects of the scan: a source that cannot win is not refined.
+        """
         best = max((other.log_evidence for other in found), default=fit.log_evidence)
         if source := switchings(rest, fit, best - fit.log_evidence):
             yield source

@@ -16,13 +16,14 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.data.runs import Run
+from compensator.diagnose.background import LAGS_MIN
 from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.events import HEAT, swings
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.nearest import AT, TEMPERATURE
 from compensator.model.effects.blocks import FilterBank, Lag
-from compensator.model.effects.hypothesis import Place
+from compensator.model.effects.hypothesis import DEGC, Place
 from compensator.model.effects.input import unit_of
+from compensator.model.effects.regression import AMBIENT, DRIVE
 from compensator.model.effects.seen import roughly, unit_of_channel
 from compensator.model.effects.signals import RecordSignals
 
@@ -35,10 +36,10 @@ LEAST_AMBIENT_K, AIR_H, SET_MIN = 2.0, 1.0, 15.0
 FOLLOWS = 0.7
 #: And if each half of the record leaves less than this share of the variance in the other.
 FORETOLD = 0.5
-#: Lags of that, min, and the weight that keeps its gains near zero.
-LAGS_MIN, RIDGE = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), 1e-3
-#: Difference T_Q − AT of a model without known heat, among what is set or follows.
-DIFFERENCE = "t_q_degc - at_degc"
+#: Weight that keeps the gains of that, behind `LAGS_MIN`, near zero.
+RIDGE = 1e-3
+#: T_Q − AT of a model without known heat, among what is set or follows.
+_DIFFERENCE = DRIVE["direct"]
 _UNITS = {"k": "K", "rpm": "1/min", "lpm": "l/min", "w": "W", "pct": "%"}
 
 
@@ -91,8 +92,8 @@ class Trials:
         #: Time from the first change, h.
         self._t_h: Vector = samples * self.period_min / 60.0 - REST_H
         self._known: dict[str, list[Trial]] = {}
-        self._commanded = [name for name in context.channels if not name.endswith(TEMPERATURE)]
-        self._temperatures = [name for name in context.channels if name.endswith(TEMPERATURE)]
+        self._commanded = [name for name in context.channels if not name.endswith(DEGC)]
+        self._temperatures = [name for name in context.channels if name.endswith(DEGC)]
 
     def of(self, channels: Iterable[str]) -> Iterator[Trial]:
         """Yield the tests that may tell apart what acts by some channels: those of heat, air and rest, and their own.
@@ -102,7 +103,7 @@ class Trials:
         channels : iterable of str
             Channels that the explanations name.
         """
-        for name in dict.fromkeys(("", self.heating, AT, *channels)):
+        for name in dict.fromkeys(("", self.heating, AMBIENT, *channels)):
             if name not in self._known:
                 self._known[name] = list(self._trials(name))
             yield from self._known[name]
@@ -110,9 +111,9 @@ class Trials:
     @cached_property
     def heating(self) -> str:
         """What heats the machine: the heat itself, or what T_Q − AT follows most in a model without known heat."""
-        if not self._commanded or DIFFERENCE not in self._followers:
+        if not self._commanded or _DIFFERENCE not in self._followers:
             return HEAT
-        gains = self._followers[DIFFERENCE]
+        gains = self._followers[_DIFFERENCE]
         shares = {name: float(np.ptp(self._bank(name) @ gains[name])) for name in self._commanded}
         return max(shares, key=lambda name: shares[name])
 
@@ -120,7 +121,7 @@ class Trials:
         """Return by how much something is changed in a test: to the end of what was seen that is further away."""
         values = self._recorded(name)
         low, high = np.quantile(values, [0.05, 0.95]).tolist()
-        if name == AT:
+        if name == AMBIENT:
             return float(max(high - low, LEAST_AMBIENT_K))
         if name == HEAT:
             return float(high - low)
@@ -130,7 +131,7 @@ class Trials:
     def movers(self, place: Place) -> frozenset[str]:
         """Return what moves the cause of an effect: its channel, what drives its path; nothing for time alone."""
         _, path, channel = place
-        paths = {"DTF": self.heating, "TTF": self.heating, "TDTF": AT}
+        paths = {"DTF": self.heating, "TTF": self.heating, "TDTF": AMBIENT}
         # What follows the heating can be moved by itself, too.
         return frozenset(filter(None, (paths.get(path, ""), channel, channel and self.mover(channel))))
 
@@ -148,12 +149,12 @@ class Trials:
         if not name:
             yield self._trial("Leave the machine at rest", "", {})
             return
-        if name != AT and self.size(name) == 0.0:
+        if name != AMBIENT and self.size(name) == 0.0:
             return
         size, by = self.size(name), self._in_words(name)
         hold, cycle = np.ones(self._t_h.size), 1.0 * ((self._t_h // LEVEL_H) % 2.0 == 0.0)
         sizes = np.array([0.5, 1.0, 0.5, 0.0])[(self._t_h // LEVEL_H).astype(int) % 4]
-        if name == AT:
+        if name == AMBIENT:
             ramp = np.minimum(self._t_h / AIR_H, 1.0)
             yield self._trial(f"Change the ambient temperature by {by} with the machine at rest", name, {name: ramp})
             return
@@ -209,12 +210,12 @@ class Trials:
         if context.has_ttf and model.ttf is not None:
             difference_k = model.ttf.sampled.response(heat)
         else:
-            difference_k = self._warmed(heat) if HEAT in changes else change(DIFFERENCE)
+            difference_k = self._warmed(heat) if HEAT in changes else change(_DIFFERENCE)
         run = Run(
             name="test",
             t_s=np.asarray((self._t_h + REST_H) * 3600.0),
             difference_k=difference_k,
-            ambient_k=change(AT),
+            ambient_k=change(AMBIENT),
             y_um=np.full(self._t_h.size, np.nan),
             heat_w=None,
             reference=self.evidence.runs[0].reference,
@@ -230,9 +231,9 @@ class Trials:
 
     def _recorded(self, name: str) -> Vector:
         """Return what was seen of something, all runs one after another."""
-        if name == AT:
+        if name == AMBIENT:
             return np.concatenate([record.ambient_k for record in self.evidence.signals])
-        if name in (HEAT, DIFFERENCE):
+        if name in (HEAT, _DIFFERENCE):
             return np.concatenate([record.drive for record in self.evidence.signals])
         return np.concatenate([record.channels[name] for record in self.evidence.signals])
 
@@ -268,7 +269,7 @@ class Trials:
     def _followers(self) -> Mapping[str, Mapping[str, Vector]]:
         """Temperatures that follow what is commanded and the air, with the gains of each behind every lag."""
         has_ttf = self.evidence.context.has_ttf
-        causes = [*([HEAT] if has_ttf else []), AT, *self._commanded]
+        causes = [*([HEAT] if has_ttf else []), AMBIENT, *self._commanded]
         stride = max(1, self.evidence.used.size // 400)
         table = np.concatenate([self._bank(name)[::stride] for name in causes], axis=1)
         begin = np.cumsum([0, *[record.size for record in self.evidence.signals]])
@@ -279,7 +280,7 @@ class Trials:
         half = np.arange(which.size) < which.size / 2
         foretell = [(_regression(table[of] / scale, levels[of]), ~of) for of in (half, ~half)]
         found = {}
-        for name in [*self._temperatures, *([] if has_ttf else [DIFFERENCE])]:
+        for name in [*self._temperatures, *([] if has_ttf else [_DIFFERENCE])]:
             values = self._recorded(name)[::stride]
             gains, explained = solve(values)
             # Enough lags explain any slow course; each half of the record foretells the other only where it follows.

@@ -49,6 +49,7 @@ from compensator.events import EventKind
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopRun
+from compensator.service.loop.weighing import failed
 from sim_hardware.drawn_machines.weeks import DEVELOPMENT_WEEKS, SEALED_WEEK_RUNS, SEALED_WEEKS
 from tests.bench.cases import judge
 from tests.bench.figures import Figure, rows, told
@@ -85,7 +86,7 @@ class Diagnoses:
             try:
                 self.found[key] = self._diagnose(outcomes, model)
             except CompensatorError as error:  # as LoopRun has it
-                self.found[key] = Diagnosed("failed", (), None, f"the diagnosis failed: {error}", needs=str(error))
+                self.found[key] = failed(str(error))
             self.seconds += time.perf_counter() - began
         return self.found[key]
 

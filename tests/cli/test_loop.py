@@ -11,6 +11,7 @@ import pytest
 from compensator.api import shop
 from compensator.cli import main
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
+from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.run import Diagnosed
 from tests.audit.made import CONFIG, QUILL, Service, readings
 
@@ -26,7 +27,9 @@ TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
 )
 
 
-def recorded(folder: Path, minutes: int, *, config: bytes = CONFIG, told: tuple[Any, ...] = (), hold: int = -1) -> Path:
+def recorded(
+    folder: Path, minutes: int, *, config: bytes = CONFIG, told: tuple[Any, ...] = (), hold: int = -1, resume: int = -1
+) -> Path:
     service = Service(folder, config=config)
     for i, values in enumerate(readings(minutes)):
         for minute, kind, text, data in told:
@@ -34,6 +37,8 @@ def recorded(folder: Path, minutes: int, *, config: bytes = CONFIG, told: tuple[
                 service.note(kind, text, data)
         if i == hold:
             service.command("hold")
+        if i == resume:
+            service.command("resume")
         service.take(values)
     service.stop()
     return folder
@@ -111,6 +116,15 @@ def test_samples_during_a_hold_by_hand_are_not_diagnosed(
     monkeypatch.setattr(shop, "diagnosis_in_process", finds_nothing(seen))
     (one,) = result([str(recorded(tmp_path / "held", 1500, hold=30))], capsys)
     assert one["diagnoses"] == 0 and not seen
+
+
+def test_a_resume_of_the_recordings_is_one_of_the_models_in_shadow_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resumed: list[ModelLoop] = []
+    monkeypatch.setattr(ModelLoop, "resume", lambda core: resumed.append(core))
+    result([str(recorded(tmp_path / "held", 120, hold=30, resume=60))], capsys)
+    assert len(resumed) == 1
 
 
 def test_a_shop_is_a_folder_of_folders_and_one_bad_machine_stops_no_other(

@@ -14,7 +14,7 @@ from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose import deployment
 from compensator.diagnose import findings as module
-from compensator.diagnose.deployment import _by_channels, _decided
+from compensator.diagnose.deployment import CONTRADICTS, _by_channels, _decided
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
 from compensator.diagnose.outcome import warnings_of
@@ -168,7 +168,7 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
     held_out = held_out_errors(ones, named=named, whole=named, ceiling=channels_um * ones)
     # Where an own error beside the names was confirmed in part, all of the channels are deployed.
     called_late = dataclasses.replace(called_late, confirmed=0.4)
-    instead = _by_channels(_decided(called_late, (), held_out))
+    instead = _by_channels(_decided(called_late, (), held_out, CONTRADICTS), CONTRADICTS)
     assert (instead is not None) is is_confirmed
     if instead:
         assert instead.found.confirmed == 1.0 and not instead.found.explains
@@ -184,7 +184,7 @@ def test_all_channels_take_the_place_of_a_late_t_q_where_they_gain_far_more(
     monkeypatch.setattr(deployment, "in_free_run", lambda _: (1.0, 0.7))
     ones = np.ones(called_late.ceiling.size)
     held_out = held_out_errors(ones, named=0.6 * ones, whole=0.6 * ones, ceiling=channels_um * ones)
-    assert (_by_channels(_decided(called_late, (), held_out)) is not None) is is_confirmed
+    assert (_by_channels(_decided(called_late, (), held_out, CONTRADICTS), CONTRADICTS) is not None) is is_confirmed
 
 
 @pytest.mark.parametrize(("limit", "is_shown"), [(0.1, False), (0.6, True)])
@@ -197,15 +197,15 @@ def test_all_channels_take_the_place_of_names_that_held_out_data_refute(
     monkeypatch.setattr(deployment, "SHORT_H", 5.0)
     ones = np.ones(called_late.ceiling.size)
     held_out = held_out_errors(ones, named=3.0 * ones, whole=3.0 * ones, ceiling=2.0 * ones)
-    decided = _decided(called_late, (), held_out)
+    decided = _decided(called_late, (), held_out, CONTRADICTS)
     assert decided.contradicted and decided.is_refused
-    instead = _by_channels(decided)
+    instead = _by_channels(decided, CONTRADICTS)
     assert (instead is not None) is is_shown
     if instead:
         assert not instead.is_refused and not instead.found.explains
         # What is refused itself takes no place.
         monkeypatch.setattr(deployment, "SHORT_H", 8.0)
-        assert _by_channels(decided) is None
+        assert _by_channels(decided, CONTRADICTS) is None
 
 
 def test_a_name_that_no_part_of_a_record_shows_is_deployed_and_not_called_confirmed() -> None:

@@ -122,8 +122,8 @@ def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(mode
     codes = [one.code for one in kept.warnings]
     assert ModelWarning.PATHS_KEPT in codes and ModelWarning.FITTED_ANEW not in codes
     silent = dataclasses.replace(model, held_out_rms_um=None)
-    assert diagnosis_module._paths_kept(evidence_of(model, runs), "explained", deployed=True)
-    assert not diagnosis_module._paths_kept(evidence_of(silent, runs), "explained", deployed=True)
+    assert diagnosis_module._paths_kept(evidence_of(model, runs), "explained", deployed=True, is_off=False)
+    assert not diagnosis_module._paths_kept(evidence_of(silent, runs), "explained", deployed=True, is_off=False)
 
 
 @pytest.mark.parametrize(

@@ -23,13 +23,15 @@ from compensator.model.model_file import load_model
 
 TOP = Path(__file__).resolve().parents[2]
 MODEL, IDENTIFY, DIAGNOSE = (TOP / f"compensator/{room}/MATHEMATICS.md" for room in ("model", "identify", "diagnose"))
-EFFECTS = TOP / "compensator/model/effects"
+EFFECTS, LOOP = TOP / "compensator/model/effects", TOP / "compensator/service/loop"
 #: `module.NAME` = value, as the pages on the mathematics quote what the code has.
 QUOTED = re.compile(r"`(\w+)\.(\w+)` = (-?[\d.]+(?:e-?\d+)?)")
 #: A row of the table of settings: `module.NAME` or `Class.name`, and its value or values.
 SETTING = re.compile(r"^\| `(\w+\.\w+)` \| (-?[\d.e-]+(?:, -?[\d.e-]+)*) \|", flags=re.MULTILINE)
 #: Settings that are only shown; the page names them without a value.
 SHOWN = {"summary.SHOWN", "advice_words.SAID", "ceiling._NAMED"}
+#: Numbers of the loop that decide nothing.
+NO_SETTINGS = {"state.STATE_SCHEMA", "process._KILLED_S"}
 
 
 def constant(room: str, holder: str, name: str) -> Any:
@@ -51,14 +53,21 @@ def test_quoted_constants_are_those_of_the_code(page: Path, least: int) -> None:
         assert float(value.rstrip(".")) == constant(page.parent.name, holder, name), f"{page}: {holder}.{name}"
 
 
-def settings_of_diagnosis() -> dict[str, tuple[float, ...]]:
-    """Every number or short row of numbers at the top of a module of diagnose, and what effects must be worth."""
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Everything that is assigned at the top of the modules of a folder."""
     found: dict[str, Any] = {}
-    for file in sorted(DIAGNOSE.parent.glob("[!_]*.py")):
-        module = importlib.import_module(f"compensator.diagnose.{file.stem}")
+    package = ".".join(folder.relative_to(TOP).parts)
+    for file in sorted(folder.glob("[!_]*.py")):
+        module = importlib.import_module(f"{package}.{file.stem}")
         assigned = [node for node in ast.parse(file.read_text("utf-8")).body if isinstance(node, ast.Assign)]
         targets = [name for node in assigned for target in node.targets for name in ast.walk(target)]
         found |= {f"{file.stem}.{t.id}": getattr(module, t.id) for t in targets if isinstance(t, ast.Name)}
+    return found
+
+
+def settings_of_diagnosis() -> dict[str, tuple[float, ...]]:
+    """Every number or short row of numbers at the top of a module of diagnose, and what effects must be worth."""
+    found = settings_of(DIAGNOSE.parent)
     for form in {base for effect in forms() for base in effect.__mro__ if issubclass(base, Effect)}:
         asked = ("worth", "worth_with_others", "removes_alone")
         found |= {f"{form.__name__}.{k}": v for k, v in vars(form).items() if k in asked}
@@ -84,6 +93,12 @@ def test_the_settings_of_the_diagnosis_are_in_its_table_and_no_others() -> None:
     for name, values in listed.items():
         known = constant("model.effects", *name.split(".")) if name in in_effects else settings[name]
         assert values == pytest.approx(known if isinstance(known, tuple) else (known,), rel=5e-3), name
+
+
+def test_the_settings_of_the_loop_are_in_its_table_and_no_others() -> None:
+    rows = SETTING.findall((LOOP / "README.md").read_text(encoding="utf-8"))
+    found = {name: value for name, value in settings_of(LOOP).items() if isinstance(value, int | float)}
+    assert {name: float(value) for name, value in rows} == {k: v for k, v in found.items() if k not in NO_SETTINGS}
 
 
 def test_examples_on_the_page_run() -> None:

@@ -77,4 +77,4 @@ def test_what_is_after_the_change_of_the_residual_is_diagnosed_again_and_ends_of
     monkeypatch.setattr(api, "WELL_EXPLAINED", 0.0)
     diagnoses_of_table(usable_table(begun), QUILL)
     assert spans[1] == pytest.approx(SAMPLES - BEGINS, abs=120)
-    assert spans == sorted(spans, reverse=True) and spans[-1] == 60.0 * api.SHORTEST_H
+    assert spans == sorted(spans, reverse=True) and spans[-1] == 60.0 * api.SHORT_H

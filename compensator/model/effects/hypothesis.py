@@ -226,8 +226,12 @@ class Context:
     @property
     def bank_min(self) -> tuple[float, ...]:
         """Time constants of a filter bank, from a sample to a third of the record, min."""
+        return self.lags_min(BANK)
+
+    def lags_min(self, count: int) -> tuple[float, ...]:
+        """Return so many time constants that any slow response is made of, from a sample on, min."""
         longest = min(BANK_LONGEST_MIN, max(self.minutes / 3.0, 20.0 * self.period_min))
-        return tuple(float(t) for t in np.geomspace(self.period_min, longest, BANK))
+        return tuple(float(t) for t in np.geomspace(self.period_min, longest, count))
 
     def surface(self) -> Free:
         """Return the time constant of a surface that follows what it exchanges heat with, as `tau`, coarser."""

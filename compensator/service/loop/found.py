@@ -14,9 +14,9 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import StartDiagnosis
-from compensator.service.loop.process import Diagnose, failed
+from compensator.service.loop.process import Diagnose
 from compensator.service.loop.shadow import Shadow
-from compensator.service.loop.weighing import Weighed
+from compensator.service.loop.weighing import Weighed, failed
 from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.turns import give_way
@@ -103,8 +103,6 @@ async def diagnosed(core: ModelLoop, diagnose: Diagnose, store: ModelStore, cloc
     except CompensatorError as error:
         found = failed(str(error))
         weighed = core.plain(found)
-    except asyncio.CancelledError:
-        raise
     except Exception as error:
         log.exception("internal error of a diagnosis")
         found = failed(f"internal error: {type(error).__name__}: {error}")

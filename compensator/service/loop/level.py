@@ -17,16 +17,16 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.change import FEWEST, changed_at
+from compensator.diagnose.change import BLOCK_MIN, FEWEST, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
-from compensator.service.transfer.comparison import BLOCK_MIN, BLOCK_NS
+from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.evidence import FLOOR_UM
 
-#: The present model was right before if it erred by less than this part of what it errs by since then, and its error
+#: The present model was right before if it erred by less than `QUIET` of what it errs by since then, and its error
 #: changed by less than this part of what the candidate's changed by.
-WAS_RIGHT, RIGHTER = 0.5, 0.8
+RIGHTER = 0.8
 #: The candidate's residual stays if its first and second half differ by less than this part of the present one's error,
 #: and the median of its deviations is less than that part.
 STAYS, SPREAD = 0.25, 0.3
@@ -134,7 +134,7 @@ def level_um(
     if np.sum(compared) < FEWEST:
         return None
     left_um, error_um = rest[compared], _rms(own[compared])
-    was_right = _rms(own[~since]) < WAS_RIGHT * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
+    was_right = _rms(own[~since]) < QUIET * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
     # Medians: while the effect begins, its lag is seen.
     middle_um = float(np.median(left_um))
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])

@@ -16,6 +16,7 @@ import msgspec
 
 from compensator.clock import HOUR_NS
 from compensator.config import Loop as LoopSettings
+from compensator.diagnose.change import BLOCK_MIN
 from compensator.errors import ServiceError
 from compensator.events import DiagnosisData, LoopAction, Note
 from compensator.service.loop.avoided import avoid
@@ -47,7 +48,6 @@ from compensator.service.loop.trust import (
 )
 from compensator.service.loop.words import begins, named, nothing_follows, surpassed, wait_over, waits
 from compensator.service.outcome import Outcome, sets_zero
-from compensator.service.transfer.comparison import BLOCK_MIN
 from compensator.service.transfer.second_opinion import described
 
 #: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
@@ -397,7 +397,7 @@ def _counted(before_min: float, present: Outcome, minutes: float, *, suspected: 
     thirty minutes without a loss, while a couple that is broken for so long leaves nothing. A state that is not known
     is no fault of a sensor: nothing is compared then, but a diagnosis starts from a state of its own.
     """
-    reasons, before_min = present.offset.reasons, min(before_min, CLEAN_MIN)
+    reasons = present.offset.reasons
     if not suspected and is_lost(reasons):
         return max(before_min - minutes, 0.0)
     if suspected or is_disturbed(reasons):

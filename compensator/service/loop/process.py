@@ -23,10 +23,11 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import CompensatorError
+from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
 from compensator.messages import UNREADABLE
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result
 from compensator.service.loop.loop import StartDiagnosis
-from compensator.service.loop.weighing import FAILED, Diagnosed
+from compensator.service.loop.weighing import FAILED, Diagnosed, failed
 
 log = logging.getLogger("compensator")
 
@@ -34,8 +35,6 @@ log = logging.getLogger("compensator")
 Diagnose = Callable[[StartDiagnosis, bytes], Awaitable[Diagnosed]]
 #: Module that the process runs.
 MODULE = "compensator.commands.loop_diagnosis"
-#: Largest result and model that are read, bytes.
-_LARGEST = 2_000_000
 #: Diagnoses whose files are kept.
 KEPT = 14
 #: Waiting for a process that was killed, s.
@@ -136,26 +135,13 @@ async def _end(process: asyncio.subprocess.Process) -> None:
                 await process.wait()
 
 
-def failed(why: str) -> Diagnosed:
-    """Return a diagnosis that gave nothing."""
-    return Diagnosed(FAILED, (), None, f"the diagnosis failed: {why}", why)
-
-
 def _read(work: Path) -> Diagnosed:
     """Read what the process has written, and trust none of it."""
     try:
-        result = msgspec.json.decode(_bytes_of(work / RESULT), type=Result)
-        model = _bytes_of(work / "model.toml") if result.effects else None
-    except (OSError, *UNREADABLE) as error:
+        result = msgspec.json.decode(read_file(work / RESULT, RESULT_BYTES), type=Result)
+        model = read_file(work / "model.toml", MODEL_BYTES) if result.effects else None
+    except (CompensatorError, OSError, *UNREADABLE) as error:
         return failed(f"its result cannot be read: {error}")
     if result.verdict == FAILED:
         return failed(result.needs)
     return Diagnosed(result.verdict, tuple(result.effects), model, result.text, result.needs, result.y_moved_utc_ns)
-
-
-def _bytes_of(path: Path) -> bytes:
-    with path.open("rb") as file:
-        data = file.read(_LARGEST + 1)
-    if len(data) > _LARGEST:
-        raise OSError(f"{path.name} is larger than {_LARGEST} bytes")
-    return data

@@ -49,9 +49,7 @@ def is_enough(found: ComparisonData, settings: LoopSettings, *, judged_h: float,
 
 def is_clearly_better(found: ComparisonData) -> bool:
     """Return whether measured Y changes clearly as the candidate predicts."""
-    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
-        return False
-    return found.ratio is not None and found.ratio <= BETTER_PART
+    return found.verdict == ComparisonVerdict.BETTER and found.ratio is not None and found.ratio <= BETTER_PART
 
 
 def is_better_about_zero(found: ComparisonData, part: float = BETTER_PART) -> bool:

@@ -34,7 +34,6 @@ class _Replayed:
     compensation: Compensation
     config: bytes
     model: bytes
-    file: str
 
 
 def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
@@ -67,9 +66,7 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
         if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
             resumed.notes += _complete(resumed, last)
             return core
-    core.drop_ended()
-    notes: list[Note] = core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
-    resumed.notes += notes
+    resumed.notes += core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
     core.drop_ended()
     return ModelLoop(config, present.model, core.attachments())
 
@@ -100,5 +97,5 @@ def _replayed(config: Config, folder: Path) -> _Replayed | None:
                 outcome = apply(compensation, step)
                 if isinstance(outcome, Outcome):
                     loop.process(outcome)
-        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"], path.name)
+        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"])
     return None

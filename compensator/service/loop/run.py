@@ -20,7 +20,7 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
-from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
+from compensator.service.loop.weighing import Diagnosed, effect_names, failed
 from compensator.service.outcome import sets_zero
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP
@@ -225,7 +225,7 @@ class LoopRun:
         try:
             return self._diagnose(record, self._calibrated)
         except CompensatorError as error:
-            return Diagnosed(FAILED, (), None, f"the diagnosis failed: {error}", needs=str(error))
+            return failed(str(error))
 
     def _keep(self, outcome: Outcome) -> None:
         """Keep what a diagnosis or a warm-up needs."""

@@ -55,6 +55,11 @@ class Diagnosed:
     y_moved_utc_ns: int = 0
 
 
+def failed(why: str) -> Diagnosed:
+    """Return a diagnosis that gave nothing."""
+    return Diagnosed(FAILED, (), None, f"the diagnosis failed: {why}", why)
+
+
 @dataclass(frozen=True, slots=True)
 class Weighed:
     """A diagnosis for the recording, and the candidate's model file; None if there is no candidate."""

@@ -16,6 +16,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.axes import FIRST
 from compensator.clock import HOUR_NS, NS
+from compensator.diagnose.change import BLOCK_MIN
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.messages import number
 from compensator.messages_axes import AxesEstimate
@@ -31,8 +32,8 @@ SURE_PART = 0.5
 WORSE_PART = 0.05
 #: Fewer changes of block means, or probes, do not judge a model.
 FEWEST = 8
-#: Length of a block, min, and the part of it that must be measured.
-BLOCK_MIN, _MEASURED = 30.0, 0.5
+#: The part of a block that must be measured.
+_MEASURED = 0.5
 BLOCK_NS = round(BLOCK_MIN * 60 * NS)
 
 

@@ -19,6 +19,7 @@ from compensator.axes import FIRST, AxisWords, label_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Config
+from compensator.diagnose.change import BLOCK_MIN
 from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.model.thermal_model import ThermalModel
@@ -26,7 +27,7 @@ from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import RecordedStep
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import RecordedRun, Window, usable_steps, window_of
-from compensator.service.transfer.comparison import BLOCK_MIN, FEWEST, Comparison, changed, not_judged
+from compensator.service.transfer.comparison import FEWEST, Comparison, changed, not_judged
 
 #: How much of the record is compared, h.
 COMPARED_H = 24.0
