@@ -1,4 +1,4 @@
-"""Array types for signatures, and constants that all packages share."""
+"""Array types for signatures, and constants and figures that all packages share."""
 
 from __future__ import annotations
 
@@ -22,3 +22,14 @@ Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.int_]
 #: Poles and zeros, shape (n,).
 ComplexVector = npt.NDArray[np.complex128]
+
+
+def rms_of(values: Vector) -> float:
+    """Return the root mean square of the values that are not missing.
+
+    Examples
+    --------
+    >>> rms_of(np.array([3.0, NAN, -3.0]))
+    3.0
+    """
+    return float(np.sqrt(np.nanmean(values**2)))

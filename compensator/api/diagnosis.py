@@ -44,12 +44,12 @@ from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError
 from compensator.identify.pairs import pairs
-from compensator.model.effects.hypothesis import Place
+from compensator.model.effects.hypothesis import Place, place_in_words
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_axes, write_model
 from compensator.model.simulation import require_channels
 from compensator.model.thermal_model import ThermalModel
-from compensator.progress import ExecutorMap, Progress, unreported
+from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -246,7 +246,7 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
             cells = (
                 f"{shares[axis].moves_um:z.1f} ± {shares[axis].std_um:.1f}".replace("-", "−") for axis in self.results
             )
-            rows.append([" ".join(filter(None, one.place)), *cells])
+            rows.append([place_in_words(one.place), *cells])
         head = ["effect", *map(label_of, self.results)]
         note = "The same form on every axis, its size fitted; negative: against its channel."
         return Table(title="What each effect moves, µm peak to peak", head=head, rows=rows, note=note)
@@ -342,7 +342,16 @@ def diagnose(
         assert executor is not None
         return executor.map(partial(in_one_thread, function), *values)
 
-    def diagnosed(one: str, number: int, of: int, expected: frozenset[Place] = frozenset()) -> DiagnosisResult:
+    total = 0
+
+    def counted(done: int, steps: int) -> None:
+        nonlocal total
+        total = steps
+        progress(done, steps)
+
+    def diagnosed(
+        one: str, number: int, of: int, report: Progress, expected: frozenset[Place] = frozenset()
+    ) -> DiagnosisResult:
         words = words_of(one, given, validation, models=[bases[one].name])
         with words.errors():
             return _diagnosed(
@@ -355,15 +364,16 @@ def diagnose(
                 expected=expected,
                 keep_paths=keep_paths,
                 all_data=all_data or fit_until_h is not None or len(axes) > 1,
-                progress=lambda done, steps: progress(number * steps + done, of * steps),
+                progress=lambda done, steps: report(number * steps + done, of * steps),
                 executor_map=executor_map if executor else map,
             )
 
-    results = {one: diagnosed(one, i, len(axes)) for i, one in enumerate(axes)}
+    results = {one: diagnosed(one, i, len(axes), counted) for i, one in enumerate(axes)}
     if len(results) == 1:
         return next(iter(results.values()))
     missing = missing_places({one: result.diagnosis for one, result in results.items()})
-    results |= {one: diagnosed(one, i, len(missing), places) for i, (one, places) in enumerate(missing.items())}
+    again = after(progress, total)
+    results |= {one: diagnosed(one, i, len(missing), again, places) for i, (one, places) in enumerate(missing.items())}
     models = axes_as_in_file({one: result.model for one, result in results.items()})
     results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
     names = [one for one in axes if all(column_of(one) in each.table.columns for each in given)]

@@ -13,6 +13,7 @@ from compensator.commands.diagnose import diagnose_files
 from compensator.demo.calibration import PERIOD_S
 from compensator.demo.day import Day, run_day
 from compensator.demo.figures import errors_of
+from compensator.model.effects.hypothesis import place_in_words
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import dump_model
 from sim_hardware.physics import draw_effect
@@ -119,7 +120,7 @@ def figures_of_loop(
     drawn, found = effect.reveal().describe(), adopted.found
     figures = {
         "drawn": " ".join(str(drawn[key]) for key in ("kind", "path", "channel") if drawn.get(key)),
-        "found": [" ".join(filter(None, (e["kind"], e["path"], e["channel"]))) for e in found["effects"]],
+        "found": [place_in_words((e["kind"], e["path"], e["channel"])) for e in found["effects"]],
         "verdict": found["verdict"],
         "report": found["report"],
         "explanation": [e["explanation"] for e in found["effects"]],

@@ -153,11 +153,6 @@ def advice_of(
     )
 
 
-def label(term: Term) -> str:
-    """Return kind, path and channel of a term in words."""
-    return " ".join(filter(None, term.hypothesis.place))
-
-
 # ---------------------------------------------------------------------- what is left
 
 
@@ -271,9 +266,9 @@ def _seen_once(fit: Fit, deciding: Deciding) -> Iterator[SeenOnce]:
         if not driver or deciding.trials.swings(driver) > ONCE_SWINGS:
             continue
         without = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
-        test = deciding.best(fit, without, (label(term), "nothing"), drivers=(driver,))
+        test = deciding.best(fit, without, (term.label, "nothing"), drivers=(driver,))
         if test is not None:
-            yield SeenOnce(label=label(term), driver=driver, test=test)
+            yield SeenOnce(label=term.label, driver=driver, test=test)
 
 
 def _driver(term: Term, trials: Trials) -> str:

@@ -24,6 +24,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 MOVES = 8.0
 #: Samples whose median is where a channel is as a record begins.
 BEGINS = 10
+#: A channel has a zero, so that its square may act, if it comes as near to 0 as this share of its span.
+ZEROED = 0.05
 #: A record begins warm if what the machine had at its start is more than this share of the span of the DTF's share.
 WARM_SHARE = 0.05
 
@@ -131,7 +133,7 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals], apart: Con
         values = np.concatenate([record.channels[name] for record in signals])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
             spans[name] = float(np.ptp(values))
-            if np.min(np.abs(values)) < 0.05 * np.ptp(values) and not name.endswith(DEGC):
+            if np.min(np.abs(values)) < ZEROED * np.ptp(values) and not name.endswith(DEGC):
                 zeroed.add(name)
     paths = {name: path.sampled for name, path in (("DTF", model.dtf), ("TDTF", model.tdtf)) if path is not None}
     both = (("DTF", model.dtf), ("TDTF", model.tdtf))

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensator.arrays import rms_of
 from compensator.diagnose.findings import Findings, by_channels, in_free_run
 from compensator.diagnose.fit import late_term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.held_out import HeldOut
-from compensator.diagnose.outcome import rms_of
 
 #: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor. It is not near 1:
 #: each block may hold an event of its own, and the others then know less of an effect, and may name it otherwise. But

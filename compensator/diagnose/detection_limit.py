@@ -111,7 +111,7 @@ def detection_limits(selection: Selection, cost: float) -> DetectionLimits:
         matters_um=MATTERS * float(np.nanmax(measured) - np.nanmin(measured)),
         values=points.count,
         every_min=points.period_min,
-        undecided=tuple(dict.fromkeys(" ".join(filter(None, other.terms[-1].hypothesis.place)) for other in undecided)),
+        undecided=tuple(dict.fromkeys(other.terms[-1].label for other in undecided)),
     )
 
 

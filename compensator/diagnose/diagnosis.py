@@ -13,10 +13,10 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
-from compensator.diagnose.advice import advice_of, label
+from compensator.diagnose.advice import advice_of
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
@@ -31,7 +31,7 @@ from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
+from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
@@ -260,9 +260,7 @@ def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]
         return []
     first = undecided[0]
     second = next((fit for fit in undecided if fit.places != first.places), found.selection.fit)
-    test = deciding.best(
-        first, second, (label(first.terms[-1]), label(second.terms[-1]) if second.terms else "nothing")
-    )
+    test = deciding.best(first, second, (first.terms[-1].label, second.terms[-1].label if second.terms else "nothing"))
     return [test] if test is not None else []
 
 
@@ -288,7 +286,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
         signal = found.left_in_um if is_left_in else found.responses[i]
 
         def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
-            return deciding.best(selection.fit, rival.fit, (label(first), label(rival.term)))
+            return deciding.best(selection.fit, rival.fit, (first.label, rival.term.label))
 
         effect = described(term, std, signal, evidence)
         if few:

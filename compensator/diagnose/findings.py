@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Vector, rms_of
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN, MOSTLY
 from compensator.diagnose.evidence import Evidence
@@ -359,8 +359,7 @@ def in_free_run(found: Findings) -> tuple[float, float]:
     at_rest = all(signals.initial_um is None for signals in evidence.signals)
 
     def left_um(added: Vector) -> float:
-        left = evidence.left(added + of_time, at_rest=at_rest)[evidence.used]
-        return float(np.sqrt(np.mean(left**2)))
+        return rms_of(evidence.left(added + of_time, at_rest=at_rest)[evidence.used])
 
     return left_um(by_base(evidence)), left_um(found.whole - hidden - of_time)
 

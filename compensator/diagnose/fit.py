@@ -16,7 +16,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, factor_of, learned_rest, solution
 from compensator.diagnose.points import Rest, raw_columns
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Free, Hypothesis, Place
+from compensator.model.effects.hypothesis import Free, Hypothesis, Place, place_in_words
 
 Start = tuple[Hypothesis, Sequence[float]]
 
@@ -41,6 +41,11 @@ class Term:
     hypothesis: Hypothesis
     values: tuple[float, ...]
     amplitudes: tuple[float, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Kind, path and channel in words."""
+        return place_in_words(self.hypothesis.place)
 
     @property
     def effect(self) -> Effect:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.advice import label
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
@@ -189,7 +188,7 @@ class Rival:
     @property
     def label(self) -> str:
         """Kind and place in words."""
-        return label(self.term)
+        return self.term.label
 
 
 def described(term: Term, std: Mapping[str, float], signal: Vector, evidence: Evidence) -> Effect:

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Indices, Mask, Vector
+from compensator.arrays import Indices, Mask, Vector, rms_of
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.likelihood import RandomColumns
-from compensator.diagnose.outcome import FOLDS, Step, rms_of
+from compensator.diagnose.outcome import FOLDS, Step
 from compensator.diagnose.own_error import own_error_alone
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Grid

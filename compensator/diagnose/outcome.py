@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from compensator.arrays import Vector
+from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice import Advice
 from compensator.diagnose.detection_limit import DetectionLimits
@@ -207,11 +205,6 @@ class Diagnosis:
     def _scores(self, residual: Vector) -> Scores:
         y = self.evidence.y_um
         return scores(y, y - residual)
-
-
-def rms_of(values: Vector) -> float:
-    """Return the root mean square of the values that are not missing."""
-    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def warnings_of(

@@ -175,7 +175,7 @@ class Points:
         noise_um = self.evidence.probe_um / math.sqrt(stride)
         # What a calibration or the form of a path misses is no slow process: it is largest right after a change.
         if self.evidence.free_paths:
-            noise_um = math.hypot(noise_um, FORM_ERROR[True] * self.spread_um)
+            noise_um = math.hypot(noise_um, FORM_ERROR[1] * self.spread_um)
         elif not self.is_exact:
             noise_um = math.hypot(noise_um, self.own_um)
         slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
@@ -246,7 +246,7 @@ class Points:
         sizes_um : mapping of str to float
             Standard deviation of what each channel adds by effects, µm; of the base's paths under an empty name.
         """
-        share = FORM_ERROR[not self.is_exact]
+        share = FORM_ERROR[0 if self.is_exact else 1]
         forms = tuple((channel, share * size) for channel, size in sizes_um.items() if channel)
         return dataclasses.replace(rest, own_um=math.hypot(self.own_um, share * sizes_um.get("", 0.0)), forms=forms)
 

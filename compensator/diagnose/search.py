@@ -32,6 +32,9 @@ DOUBT = 4.5
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
 ALIAS_FREE = 3.0
+#: Effects are proposed beside a small slow rest, too, if that of the fit is larger by the first factor, and beside one
+#: between them if it is larger by the second.
+SMALLER = (1.5, 6.0)
 #: Kinds of what may change in a path that stays linear.
 OF_PATHS = ("dynamics", "gain", "delay")
 
@@ -212,9 +215,9 @@ class Search:
         """Return the rests with which effects are proposed: as it is, small, and between."""
         small = min(fit.rest.slow_um, max(self.evidence.probe_um, self.points.own_um))
         views = [fit.rest]
-        if fit.rest.slow_um > 1.5 * small:
+        if fit.rest.slow_um > SMALLER[0] * small:
             views.append(dataclasses.replace(fit.rest, slow_um=small))
-        if fit.rest.slow_um > 6.0 * small:
+        if fit.rest.slow_um > SMALLER[1] * small:
             views.append(dataclasses.replace(fit.rest, slow_um=math.sqrt(fit.rest.slow_um * small)))
         return views
 

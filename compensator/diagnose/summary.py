@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from compensator.arrays import rms_of
 from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
@@ -17,7 +18,7 @@ from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import free_run_sentence, off_zero
-from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder, rms_of
+from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.standing import words as of_the_effects
 from compensator.display import Listing, Table, Words, warnings_of, with_std

@@ -7,9 +7,9 @@ from typing import Self
 
 import numpy as np
 
-from compensator.arrays import NAN, Indices, Vector
+from compensator.arrays import NAN, Indices, Vector, rms_of
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.outcome import FOLDS, Diagnosis, rms_of
+from compensator.diagnose.outcome import FOLDS, Diagnosis
 from compensator.diagnose.summary import name
 from compensator.report.figure import Bar, Edges, Figure, Line
 

@@ -33,6 +33,11 @@ def sets_zero(outcome: Outcome) -> bool:
     return any(note.kind == EventKind.ZERO for note in outcome.notes)
 
 
+def sets_zero_at_rest(outcome: Outcome) -> bool:
+    """Return whether a zero at rest was set at a sample."""
+    return any(note.kind == EventKind.ZERO and note.data["mode"] == "rest" for note in outcome.notes)
+
+
 class Values(msgspec.Struct):
     """Usable values of one sample; NaN where a channel is not usable.
 

@@ -1,4 +1,4 @@
-"""Drawn cases judged in processes beside each other, and the words of what was found."""
+"""Drawn cases judged in processes beside each other."""
 
 import json
 import os
@@ -33,8 +33,3 @@ def judge(cases, judged, out, *, workers=None, resume=False):
             results += found
             out.write_text(json.dumps(results, indent=1), encoding="utf-8")
             yield from found
-
-
-def named(place):
-    """Return kind, path and channel of an effect as words."""
-    return " ".join(filter(None, place))

@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 
 import compensator as tc
+from compensator.model.effects.hypothesis import place_in_words
 from sim_hardware.drawn_machines import DEVELOPMENT, FAMILIES, SEALED, SEALED_RUNS
-from tests.bench.cases import judge, named
+from tests.bench.cases import judge
 from tests.bench.figures import Figure, rows, told
 
 SETS = {"development": DEVELOPMENT, "sealed": SEALED}
@@ -82,7 +83,7 @@ def _figures(machine):
     return {
         "model": "published" if machine.published else base.kind,
         "verdict": found["verdict"],
-        "found": [named(place) for place in places],
+        "found": [place_in_words(place) for place in places],
         "named": any(place in right for place in places) or (not right and not others),
         "cleanly": (any(place in right for place in places) or not right) and not others,
         "best_um": best,

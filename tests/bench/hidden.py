@@ -50,7 +50,7 @@ def nearest_to(base, logged, *, free=False):
     evidence = evidence_of(base, runs)
     found = findings_of(evidence.with_free_paths() if free else evidence)
     near = nearest(found.selection.fit, found.selection.before.rest)
-    return [n.channel for n in near], [" ".join(filter(None, t.hypothesis.place)) for t in found.terms]
+    return [n.channel for n in near], [t.label for t in found.terms]
 
 
 def acting(base, columns, hidden):

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 import compensator as tc
+from compensator.model.effects.hypothesis import place_in_words
 from sim_hardware.drawn_machines import DEVELOPMENT
-from tests.bench.cases import judge, named
+from tests.bench.cases import judge
 from tests.bench.figures import Figure, rows, told
 from tests.bench.ridge import ridge
 
@@ -60,7 +61,7 @@ def _of_share(case, log, y, share):
         "extended": tc.simulate(why.model, log)["y_pred_um"],
     }
     result |= {name: errors(predicted[name], y, ~used) for name in METHODS}
-    found = [named((effect.kind, effect.path, effect.channel)) for effect in why.effects]
+    found = [place_in_words((effect.kind, effect.path, effect.channel)) for effect in why.effects]
     return result | {"verdict": why.verdict, "found": found}
 
 

@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.api import diagnosis as api_diagnosis
 from compensator.cli import main
 from compensator.data.axes import of_axis
 from compensator.data.measurement import measurements, runs_in
@@ -68,6 +70,27 @@ def test_each_axis_gets_its_own_effect_in_one_file(found, files, tmp_path):
     before, after = tc.simulate(base, table), tc.simulate(loaded, table)
     for axis in ("y", "z"):
         assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
+
+
+def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch):
+    """Another axis has shown an effect that this one may have, too."""
+    told = []
+
+    class StopSearch(Exception):
+        pass
+
+    def diagnosed(base, given, validation, words, *, expected, progress, **_):
+        progress(0, 4)
+        progress(4, 4)
+        if expected:
+            raise StopSearch
+        return SimpleNamespace(diagnosis=None)
+
+    monkeypatch.setattr(api_diagnosis, "_diagnosed", diagnosed)
+    monkeypatch.setattr(api_diagnosis, "missing_places", lambda _: {"x": frozenset({PLACE})})
+    with pytest.raises(StopSearch):
+        tc.diagnose(*files, progress=lambda done, total: told.append((done, total)))
+    assert told == [(0, 12), (4, 12), (4, 12), (8, 12), (8, 12), (12, 12), (12, 16), (16, 16)]
 
 
 def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():

@@ -58,6 +58,17 @@ class Free:
 Place = tuple[str, str, str]
 
 
+def place_in_words(place: Place) -> str:
+    """Return kind, path and channel in words.
+
+    Examples
+    --------
+    >>> place_in_words(("input", "", "coolant_degc"))
+    'input coolant_degc'
+    """
+    return " ".join(filter(None, place))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypothesis:
     """One way in which the model could lack something.
@@ -106,7 +117,7 @@ class Hypothesis:
     @property
     def label(self) -> str:
         """Kind, place and form in words."""
-        return " ".join(filter(None, (*self.place, f"({self.form})" if self.form else "")))
+        return place_in_words(self.place) + (f" ({self.form})" if self.form else "")
 
     def grid(self) -> list[tuple[float, ...]]:
         """Return the points where a search begins."""

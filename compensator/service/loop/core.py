@@ -21,6 +21,7 @@ from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
 from compensator.service.loop.state import LoopState, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
+from compensator.service.outcome import sets_zero_at_rest
 from compensator.service.status import Handover, Zero
 from compensator.service.transfer.second_opinion import described
 
@@ -285,7 +286,7 @@ def warmed_on(
     compensation = Compensation(config, model)
     compensation.begin(None)
     shadow = Shadow(compensation, b"")
-    begin = max((i for i, outcome in enumerate(record) if is_rest(outcome)), default=-1)
+    begin = max((i for i, outcome in enumerate(record) if sets_zero_at_rest(outcome)), default=-1)
     last = record[begin] if begin >= 0 else at_rest
     if last is not None:
         shadow.process(last)
@@ -302,8 +303,3 @@ def warmed_on(
             error.update(other)
         last = outcome
     return compensation
-
-
-def is_rest(outcome: Outcome) -> bool:
-    """Return whether a zero at rest was set with a sample."""
-    return any(note.kind == EventKind.ZERO and note.data["mode"] == "rest" for note in outcome.notes)

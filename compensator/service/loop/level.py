@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import rms_of
 from compensator.diagnose.change import BLOCK_MIN, FEWEST, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
@@ -133,8 +133,8 @@ def level_um(
     compared = since & (numbers * BLOCK_NS >= since_ns)
     if np.sum(compared) < FEWEST:
         return None
-    left_um, error_um = rest[compared], _rms(own[compared])
-    was_right = _rms(own[~since]) < QUIET * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
+    left_um, error_um = rest[compared], rms_of(own[compared])
+    was_right = rms_of(own[~since]) < QUIET * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
     # Medians: while the effect begins, its lag is seen.
     middle_um = float(np.median(left_um))
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
@@ -142,7 +142,3 @@ def level_um(
     stays = abs(halves[1] - halves[0]) < STAYS * error_um and spread_um < SPREAD * error_um
     moves = abs(middle_um) <= _MOST * np.ptp(own - rest)
     return middle_um if was_right and stays and moves else None
-
-
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2)))

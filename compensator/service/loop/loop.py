@@ -34,7 +34,7 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.proof import is_better_to_go_back_to, is_limited
+from compensator.service.loop.proof import is_better_to_go_back_to
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place, Running, same_effects
@@ -42,6 +42,7 @@ from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
     is_disturbed,
+    is_limited,
     is_lost,
     suspicions,
     was_wrong,

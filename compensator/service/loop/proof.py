@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
-from compensator.service.outcome import Outcome
 
 #: A candidate must be wrong by less than this part of what the present model is wrong by.
 BETTER_PART = 0.95
@@ -19,7 +17,6 @@ LEVEL_PART = 0.8
 CANDIDATES = 3
 #: The service does not go back where the present model is wrong about the zero by less than this part.
 _BACK_PART = 0.5
-_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
 def shared(deviations: float, candidates: int) -> float:
@@ -64,8 +61,3 @@ def is_better_to_go_back_to(found: ComparisonData) -> bool:
     if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
         return False
     return found.present_rms_um >= _BACK_PART * found.candidate_rms_um
-
-
-def is_limited(outcome: Outcome) -> bool:
-    """Return whether a model has reached a limit."""
-    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)

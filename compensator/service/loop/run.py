@@ -17,11 +17,11 @@ from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
 from compensator.messages import UNREADABLE, Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.loop.core import ModelLoop, is_rest, warmed_on
+from compensator.service.loop.core import ModelLoop, warmed_on
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import Diagnosed, effect_names, failed
-from compensator.service.outcome import sets_zero
+from compensator.service.outcome import sets_zero, sets_zero_at_rest
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP
 
@@ -231,7 +231,7 @@ class LoopRun:
         """Keep what a diagnosis or a warm-up needs."""
         assert self._config.loop is not None
         self._record.append(outcome)
-        if is_rest(outcome):
+        if sets_zero_at_rest(outcome):
             self._at_rest, self._warm_ns = outcome, 0
         elif sets_zero(outcome):
             self._warm_ns = outcome.sample.time_utc_ns

@@ -23,6 +23,7 @@ _LOST = (Reason.T_Q_MISSING, Reason.AT_MISSING)
 _FAULTS = (Reason.OPERATOR_HOLD, Reason.INTERNAL_ERROR, *_CONTRADICTED)
 _DISTURBED = (*_LOST, *_FAULTS)
 _ALARMS = (Reason.IMPLAUSIBLE, Reason.RESIDUAL_TOO_LARGE)
+_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
 def is_disturbed(reasons: Sequence[str]) -> bool:
@@ -44,6 +45,11 @@ def is_contradicted(reasons: Sequence[str]) -> bool:
 def is_alarmed(reasons: Sequence[str]) -> bool:
     """Return whether measured and predicted Y diverge."""
     return any(reason.startswith(_ALARMS) for reason in reasons)
+
+
+def is_limited(outcome: Outcome) -> bool:
+    """Return whether a model has reached a limit."""
+    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
 
 
 def suspicions(*outcomes: Outcome) -> list[str]:

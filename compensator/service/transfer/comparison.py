@@ -13,7 +13,7 @@ import math
 import msgspec
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Vector, rms_of
 from compensator.axes import FIRST
 from compensator.clock import HOUR_NS, NS
 from compensator.diagnose.change import BLOCK_MIN
@@ -294,8 +294,8 @@ class Comparison:
             verdict=ComparisonVerdict.NOT_JUDGED,
             measured_by="probe",
             probes=own.size,
-            present_rms_um=_rms(own),
-            candidate_rms_um=_rms(other),
+            present_rms_um=rms_of(own),
+            candidate_rms_um=rms_of(other),
         )
         if own.size < FEWEST:
             return changed(scores, why=NotJudged.TOO_LITTLE)
@@ -362,7 +362,3 @@ def _changes(blocks: list[Block]) -> tuple[Vector, Vector, Vector]:
         before = block
     own, other, y = np.array(rows).reshape(-1, 3).T
     return own, other, y
-
-
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2)))
