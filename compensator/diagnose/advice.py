@@ -165,7 +165,7 @@ def _unexplained(found: Findings, *, explained_pct: float | None, is_explained: 
         assert isinstance(effect, Unobserved)
         return _described("unobserved", found, course, effect.tau_min, list(effect.times))
     falls_short = explained_pct is not None and explained_pct < SHORT_PCT
-    if found.remainder is not None and not found.belongs and (falls_short or not evidence.free_paths):
+    if found.remainder is not None and not found.is_own_error and (falls_short or not evidence.free_paths):
         course = found.remainder.added - found.own_paths
         return _described("remainder", found, course, _memory_min(course, evidence.context.period_min), [])
     if not is_explained:

@@ -150,9 +150,9 @@ def _with_remainder_that_helps(
         # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
         whole = held_out.whole if found.remainder is not None else held_out.nothing
         held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
-    if found.belongs and not evidence.free_paths:
+    if found.is_own_error and not evidence.free_paths:
         return _as_far_as_confirmed(found, effects, held_out)
-    if found.remainder is None or found.belongs:
+    if found.remainder is None or found.is_own_error:
         return found, effects, held_out
     whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
     if evidence.is_sparse:
@@ -161,11 +161,11 @@ def _with_remainder_that_helps(
     elif late_term(found.selection.fit):
         helps = whole_um < LOWERS_CLEARLY * named_um
     else:
-        helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
+        helps = evidence.free_paths or whole_um <= (named_um if found.deploys_names else min(named_um, nothing_um))
     if helps:
         return found, effects, held_out
     without = dataclasses.replace(held_out, whole=held_out.named)
-    return dataclasses.replace(found, remainder=None, explains=True), _not_replaced(effects), without
+    return dataclasses.replace(found, remainder=None, deploys_names=True), _not_replaced(effects), without
 
 
 def _as_far_as_confirmed(
@@ -185,8 +185,8 @@ def _as_far_as_confirmed(
     whole = without - share * gained
     if share > 0.0:
         found = dataclasses.replace(found, remainder=remainder.times(share), confirmed=share)
-    elif found.explains:
-        found = dataclasses.replace(found, remainder=None, belongs=False)
+    elif found.deploys_names:
+        found = dataclasses.replace(found, remainder=None, is_own_error=False)
     else:
         # The name was for an own error that held-out blocks do not confirm.
         found, effects, held_out = found.without_names(), (), dataclasses.replace(held_out, named=held_out.nothing)
@@ -235,7 +235,7 @@ def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: Held
     deploys = found.remainder is not None or any(effect.deployable for effect in effects)
     if hours >= SHORT_H or not deploys or evidence.is_sparse or not evidence.context.approximate:
         return None
-    if not (found.terms and found.explains) or evidence.free_paths:
+    if not (found.terms and found.deploys_names) or evidence.free_paths:
         return hours
     left = evidence.left(found.named)[evidence.used]
     is_confirmed = rms_of(held_out.whole) < rms_of(held_out.nothing)
@@ -270,6 +270,6 @@ def _worse_in_free_run(found: Findings) -> tuple[float, float] | None:
     noise and the minutes that T_Q hides leave the engine nothing of it, its correction is noise.
     """
     base_um, own_um = in_free_run(found)
-    is_late = found.explains and found.corrects_late_t_q
+    is_late = found.deploys_names and found.corrects_late_t_q
     is_worse = not found.search.evidence.is_sparse and own_um > (1.0 if is_late else WORSE) * base_um
     return (base_um, own_um) if is_worse else None

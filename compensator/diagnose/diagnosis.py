@@ -222,8 +222,8 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
         channels=tuple(dict.fromkeys(found.remainder.effect.channels_that_matter())),
         rms_before_um=rms_of(held_out.named),
         rms_after_um=rms_of(held_out.whole),
-        instead=not found.explains,
-        belongs=found.belongs,
+        instead=not found.deploys_names,
+        belongs=found.is_own_error,
         confirmed=found.confirmed,
     )
 
@@ -300,7 +300,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
                 rms_after_um=rms_without([*found.responses, signal]) if is_left_in else after,
                 signal=signal,
                 rivals=rivals_of(term, rivals, chosen, test),
-                replaced=not found.explains,
+                replaced=not found.deploys_names,
                 left_in=is_left_in,
             )
         )
@@ -354,7 +354,7 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     if found.refitted or not effects:
         return [effect.effect for effect in effects]
     terms = [term for term in found.terms if term is not found.left_in]
-    factors = std_factors(found.fit, terms, beside_own_error=found.belongs)
+    factors = std_factors(found.fit, terms, beside_own_error=found.is_own_error)
     rows = dict(zip(map(id, terms), factors, strict=True))
     # Rows belong together by their place: those of effects that the model has already come first.
     before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
@@ -476,7 +476,7 @@ def _verdict(
     def holds(values: Vector) -> bool:
         return rms_of(values) ** 2 < most_um2
 
-    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.explains and holds_in_free_run
+    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.deploys_names and holds_in_free_run
     by_names = (
         leaves_noise(found.named + found.left_in_um) and holds(held_out.named) and all(e.is_determined for e in effects)
     )

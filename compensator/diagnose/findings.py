@@ -49,12 +49,12 @@ class Findings:
         What each adds to y on every sample, µm.
     remainder : Regressed or None
         What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
-    belongs : bool
-        Whether the remainder is that own error: with which the effects were fitted; or alone, where it explains most
+    is_own_error : bool
+        Whether the remainder is the base's own error: with which the effects were fitted; or alone, where it explains most
         of what the base leaves, with a name for it in whose place it stands, or without.
     confirmed : float
         Share of the remainder that is deployed.
-    explains : bool
+    deploys_names : bool
         Whether the named effects are deployed. Where all channels together, or an own error, explain the data clearly
         better without them, their names say what resembles it most, and the remainder is deployed in their place.
     channels : Regressed
@@ -75,8 +75,8 @@ class Findings:
     terms: tuple[Term, ...]
     responses: tuple[Vector, ...]
     remainder: Regressed | None
-    belongs: bool
-    explains: bool
+    is_own_error: bool
+    deploys_names: bool
     channels: Regressed
     paths: Vector
     refitted: Regressed | None
@@ -124,14 +124,14 @@ class Findings:
     @property
     def is_own_error_alone(self) -> bool:
         """Whether the own error is deployed without effects beside it."""
-        return self.belongs and not (self.terms and self.explains)
+        return self.is_own_error and not (self.terms and self.deploys_names)
 
     @property
     def whole(self) -> Vector:
         """What effects and remainder add, µm."""
         if self.remainder is None:
             return self.named
-        return np.asarray(sum(self.responses if self.explains else (), self.remainder.added))
+        return np.asarray(sum(self.responses if self.deploys_names else (), self.remainder.added))
 
     def without_names(self) -> Findings:
         """Return the findings of a search that named nothing, without a remainder."""
@@ -143,8 +143,8 @@ class Findings:
             terms=(),
             responses=(),
             remainder=None,
-            belongs=False,
-            explains=True,
+            is_own_error=False,
+            deploys_names=True,
         )
 
     @property
@@ -238,9 +238,8 @@ def by_channels(found: Findings, *, names_are_useless: bool) -> Findings | None:
         stays = _is_no_worse(found) or not _is_worth_deploying(found.channels, known, evidence)
     if evidence.is_sparse or stays:
         return None
-    explains = not found.terms
     instead = dataclasses.replace(
-        found, remainder=found.channels, belongs=False, explains=explains, confirmed=1.0, left_in=None
+        found, remainder=found.channels, is_own_error=False, deploys_names=not found.terms, confirmed=1.0, left_in=None
     )
     return instead if _is_no_worse(instead) else None
 
@@ -280,17 +279,17 @@ def _findings_of(
     likelihood, named = fit.likelihood, as_deployed(fit)
     deployed = named
     remainder: Regressed | None
-    belongs = False
+    is_own_error = False
     if is_of_paths:
-        remainder, explains, belongs = own_error_alone(selection.before), not selection.fit.terms, True
+        remainder, deploys_names, is_own_error = own_error_alone(selection.before), not selection.fit.terms, True
     elif late:
-        remainder, explains = _beside_late(deployed[2]), True
+        remainder, deploys_names = _beside_late(deployed[2]), True
     else:
-        remainder, explains = _remainder(search, fit, background, refitted, channels)
+        remainder, deploys_names = _remainder(search, fit, background, refitted, channels)
     if remainder is None and _has_own_error(fit):
         fit = foretelling(fit)
         deployed = as_deployed(fit)
-        remainder, belongs = own_error(deployed[2]), True
+        remainder, is_own_error = own_error(deployed[2]), True
     terms, responses, _ = deployed
     found = Findings(
         search=search,
@@ -299,8 +298,8 @@ def _findings_of(
         terms=terms,
         responses=tuple(responses),
         remainder=remainder,
-        belongs=belongs,
-        explains=explains,
+        is_own_error=is_own_error,
+        deploys_names=deploys_names,
         channels=channels,
         paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
         refitted=refitted,
@@ -325,12 +324,12 @@ def _late_left_in(found: Findings, late: Term, others: Fit) -> Findings:
     if not _has_own_error(fit):
         return _left_in(_named_alone(found), late, fit)
     fit = foretelling(fit)
-    return _left_in(dataclasses.replace(_named_alone(found), remainder=own_error(fit), belongs=True), late, fit)
+    return _left_in(dataclasses.replace(_named_alone(found), remainder=own_error(fit), is_own_error=True), late, fit)
 
 
 def _named_alone(found: Findings) -> Findings:
     """Return findings without a remainder."""
-    return dataclasses.replace(found, remainder=None, belongs=False, explains=True)
+    return dataclasses.replace(found, remainder=None, is_own_error=False, deploys_names=True)
 
 
 def _left_in(found: Findings, late: Term, fit: Fit) -> Findings:
@@ -368,7 +367,7 @@ def not_deployed(found: Findings) -> tuple[Vector, Vector]:
     """Return what no channel shows, and what depends on time alone, of the named effects, µm."""
     hidden, of_time = (np.zeros(found.search.evidence.used.size) for _ in range(2))
     # A remainder in the place of effects is for all of it.
-    effects = zip(found.terms, found.responses, strict=True) if found.explains else ()
+    effects = zip(found.terms, found.responses, strict=True) if found.deploys_names else ()
     for term, added in effects:
         if not term.effect.observed:
             hidden += added
@@ -391,7 +390,7 @@ def _has_own_error(fit: Fit) -> bool:
 
 
 def _remainder(
-    search: Search, fit: Fit, background: Background, refitted: Regressed | None, ceiling: Regressed
+    search: Search, fit: Fit, background: Background, refitted: Regressed | None, channels: Regressed
 ) -> tuple[Regressed | None, bool]:
     """Choose what is deployed beside named effects by the evidence, and whether they are deployed themselves.
 
@@ -405,17 +404,17 @@ def _remainder(
         All channels and the base's paths.
     refitted : Regressed or None
         The base's paths fitted together with them, where nothing was known of those.
-    ceiling : Regressed
+    channels : Regressed
         All channels without the named effects.
     """
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
-    beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
+    beside = background.fitted(points, fit.added, fit.rest) if fit.terms else channels
     known = refitted.log_evidence if refitted else _log_evidence(fit)
     # A name costs something, its deployment does not. But where nothing is known of the paths, names carry the whole
     # deformation into states that were not seen.
     charge = search.criterion.charge(fit) + WORTH if evidence.free_paths else 0.0
-    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - charge:
-        return ceiling, False
+    if fit.terms and channels.log_evidence > max(known, beside.log_evidence) - charge:
+        return channels, False
     return beside if _is_worth_deploying(beside, known, evidence) else None, True
 
 

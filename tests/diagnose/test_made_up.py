@@ -48,7 +48,7 @@ def found_on(machine: Any, base: Any) -> Findings:
     return findings_of(_evidence(base, runs))
 
 
-def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, explains: bool = True) -> Any:
+def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, deploys_names: bool = True) -> Any:
     """Findings with given effects, what they add, and a residual without nuisances."""
     kinds = {
         "hidden": SimpleNamespace(observed=False, deployable=False),
@@ -68,7 +68,7 @@ def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, explains:
         terms=[SimpleNamespace(effect=kinds[kind]) for kind, _ in effects],
         responses=[added for _, added in effects],
         whole=np.sum([added for _, added in effects], axis=0),
-        explains=explains,
+        deploys_names=deploys_names,
     )
 
 
@@ -92,7 +92,7 @@ def test_a_drift_counts_neither_way() -> None:
 
 
 def test_a_remainder_in_the_place_of_effects_is_for_the_drift_too() -> None:
-    found = of([("gain", 3.0 * HEAT), ("drift", -6.0 * SOURCE)], 5.0 * HEAT - 6.0 * SOURCE, explains=False)
+    found = of([("gain", 3.0 * HEAT), ("drift", -6.0 * SOURCE)], 5.0 * HEAT - 6.0 * SOURCE, deploys_names=False)
     found.whole = 5.0 * HEAT - 6.0 * SOURCE
     assert in_free_run(found)[1] == pytest.approx(0.0, abs=1e-12)
 
@@ -146,9 +146,9 @@ def called_late() -> Findings:
 
 def test_all_channels_may_be_better_where_the_engine_is_worse_with_the_names(called_late: Findings) -> None:
     before_um, after_um = in_free_run(called_late)
-    assert called_late.explains and after_um > before_um
+    assert called_late.deploys_names and after_um > before_um
     instead = by_channels(called_late, names_are_useless=False)
-    assert instead is not None and not instead.explains and instead.terms == called_late.terms
+    assert instead is not None and not instead.deploys_names and instead.terms == called_late.terms
     assert in_free_run(instead)[1] < 0.5 * before_um
 
 
@@ -171,7 +171,7 @@ def test_all_channels_take_their_place_where_held_out_data_confirm_it_clearly(
     instead = _by_channels(_decided(called_late, (), held_out, CONTRADICTS), CONTRADICTS)
     assert (instead is not None) is is_confirmed
     if instead:
-        assert instead.found.confirmed == 1.0 and not instead.found.explains
+        assert instead.found.confirmed == 1.0 and not instead.found.deploys_names
         assert instead.held_out.whole[0] == channels_um
 
 
@@ -202,7 +202,7 @@ def test_all_channels_take_the_place_of_names_that_held_out_data_refute(
     instead = _by_channels(decided, CONTRADICTS)
     assert (instead is not None) is is_shown
     if instead:
-        assert not instead.is_refused and not instead.found.explains
+        assert not instead.is_refused and not instead.found.deploys_names
         # What is refused itself takes no place.
         monkeypatch.setattr(deployment, "SHORT_H", 8.0)
         assert _by_channels(decided, CONTRADICTS) is None

@@ -56,7 +56,7 @@ def diagnosed(monkeypatch, searched, remainder_um):
         points = found.search.points
         fitted = Background(evidence).fitted(points, np.zeros(points.count), found.selection.before.rest)
         remainder = dataclasses.replace(fitted, added=remainder_um * wave(fitted.added.size))
-        return dataclasses.replace(found, remainder=remainder, explains=True)
+        return dataclasses.replace(found, remainder=remainder, deploys_names=True)
 
     search_by(monkeypatch, found_in)
     return diagnose(QUILL, day())

@@ -159,7 +159,7 @@ def beside():
 def test_as_much_of_it_is_deployed_as_held_out_blocks_confirm(beside, helps, share):
     """Of what it does on the held-out blocks, so much is right there; the rest is true of the record only."""
     found = beside
-    assert found.belongs
+    assert found.is_own_error
     random = np.random.default_rng(1)
     own = found.remainder.added - np.mean(found.remainder.added)
     noise = random.normal(0.0, 1.0, own.size)
@@ -222,7 +222,7 @@ def test_it_is_deployed_alone_where_no_name_explains_most_of_it(changed, monkeyp
 
 def test_a_name_for_an_own_error_that_held_out_blocks_do_not_confirm_goes_with_it(learned):
     found = learned[1]
-    assert found.is_own_error_alone and found.terms and not found.explains
+    assert found.is_own_error_alone and found.terms and not found.deploys_names
     nothing = found.search.evidence.residual
     held_out = held_out_errors(nothing, named=0.5 * nothing, whole=1.5 * nothing, ceiling=2.0 * nothing)
     chosen = deployment_of(found, (), held_out)
@@ -239,7 +239,7 @@ def test_what_no_path_explains_is_given_no_path_s_name(seed, tau_min):
     wandering = lfilter([1.0], [1.0, -keep], noise)
     kept = {name: columns[name] for name in ("t_q_degc", "at_degc")}
     found = findings_of(evidence_of(BASE, runs_from(kept | {"y_um": columns["y_um"] + wandering})))
-    assert not found.leaves_noise and found.terms == () and not found.belongs
+    assert not found.leaves_noise and found.terms == () and not found.is_own_error
 
 
 def test_what_all_channels_show_clearly_is_deployed_where_nothing_has_a_name():

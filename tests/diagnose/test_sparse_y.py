@@ -284,7 +284,7 @@ def test_a_remainder_that_helps_nothing_is_not_deployed(monkeypatch):
         found = findings_of(evidence, **given)
         points, rest = found.search.points, found.selection.before.rest
         everything = Background(evidence).fitted(points, np.zeros(points.count), rest)
-        return dataclasses.replace(found, remainder=everything, explains=False)
+        return dataclasses.replace(found, remainder=everything, deploys_names=False)
 
     for module in (diagnosis, held_out):
         monkeypatch.setattr(module, "findings_of", replaced)
