@@ -74,7 +74,8 @@ class Reporter:
         text = event.text
         if "by" in event.data:
             fields["BY"] = event.data["by"]
-            text += f" (by {event.data['by']}, proof: {event.data['by_proof']})"
+            proof = event.data.get("by_proof")  # the loop needs none
+            text += f" (by {event.data['by']}{f', proof: {proof}' if proof is not None else ''})"
         log.log(level(event), "%s: %s", event.kind, text, extra={"fields": fields})
 
 

@@ -50,8 +50,8 @@ class Findings:
     remainder : Regressed or None
         What the channels explain beyond them, where that is worth deploying; elsewhere the own error beside them.
     is_own_error : bool
-        Whether the remainder is the base's own error: with which the effects were fitted; or alone, where it explains most
-        of what the base leaves, with a name for it in whose place it stands, or without.
+        Whether the remainder is the base's own error: with which the effects were fitted; or alone, where it explains
+        most of what the base leaves, with a name for it in whose place it stands, or without.
     confirmed : float
         Share of the remainder that is deployed.
     deploys_names : bool

@@ -81,7 +81,7 @@ async def run_service(
     on_sample, on_poll : callable, optional
         Called after each sample, with its outcome, and after each poll.
     on_publish : callable, optional
-        Called with name and JSON of each message after it was published.
+        Called with name and JSON of each message after it was published; an error of it is logged.
     publishes : callable, optional
         Whether messages are published now, or only recorded, as those of a simulated past.
     diagnose : callable, optional
@@ -112,7 +112,11 @@ async def run_service(
                 return
             publisher.publish(name, data)
             if on_publish is not None:
-                on_publish(name, data)
+                try:
+                    on_publish(name, data)
+                except Exception:
+                    # Whoever listens must not end what is published here: half of an exchange, or a sample.
+                    log.exception("internal error of a listener to published messages")
 
         publisher = Publisher(config.zenoh, command, axes)
         try:

@@ -58,7 +58,7 @@ def of(effects: list[tuple[str, np.ndarray]], residual: np.ndarray, *, deploys_n
     evidence = SimpleNamespace(
         residual=residual,
         used=np.ones(residual.size, dtype=bool),
-        left=lambda raw, added, at_rest: raw - added,
+        left=lambda added, at_rest: residual - added,
         free_paths=False,
         is_sparse=False,
         signals=[SimpleNamespace(y_dtf_um=7.0 * HEAT, y_tdtf_um=HEAT, initial_um=None)],

@@ -145,8 +145,8 @@ def test_a_change_to_less_is_no_beginning():
     minutes = np.arange(2000.0)
     residual = np.where(minutes < 1200, 5.0, 0.1) * np.sin(minutes / 50.0)
     assert changed_at(60.0 * minutes, residual, 0.1) is not None
-    assert changed_at(60.0 * minutes, residual, 0.1, quiet=0.5) is None
-    assert changed_at(60.0 * minutes, residual[::-1], 0.1, quiet=0.5) == 60.0 * 780  # the block in which it is
+    assert changed_at(60.0 * minutes, residual, 0.1, from_quiet=True) is None
+    assert changed_at(60.0 * minutes, residual[::-1], 0.1, from_quiet=True) == 60.0 * 780  # the block in which it is
 
 
 def test_a_residual_that_stands_still_from_some_time_on_has_changed():

@@ -161,7 +161,7 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
         selection=SimpleNamespace(fit=fit, before=fit),
         terms=(),
         responses=(),
-        explains=True,
+        deploys_names=True,
         foresight=None,
         left_in=None,
         is_own_error_alone=False,

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from compensator.clock import VirtualClock
+from compensator.commands.run import Reporter
 from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
@@ -29,6 +30,7 @@ from compensator.service.loop.resuming import resume_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
+from compensator.service.systemd import ServiceManager
 from compensator.service.transfer.model_store import ModelStore, check_model
 from compensator.service.transfer.restart import resume
 from sim_hardware.physics import PublishedQuill, World
@@ -57,6 +59,7 @@ class Machine:
         self.device = FakeDevice([functools.partial(self.world.truth, name) for name in CHANNELS])
         self.outcomes: list[Outcome] = []
         self.published: list[tuple[str, bytes]] = []
+        self.reporter = Reporter(ServiceManager({}))
         self.at_sample: dict[int, Callable[[], Any]] = {}
         self.daemon: Daemon | None = None
 
@@ -72,6 +75,11 @@ class Machine:
                 await asyncio.sleep(0.002)
 
         self.clock = VirtualClock(start_ns, advance)
+
+    def publish(self, name: str, data: bytes) -> None:
+        """Take a message, as `compensator run` does after it was published."""
+        self.published.append((name, data))
+        self.reporter.report_message(name, data)
 
     @property
     def recordings(self) -> Path:
@@ -111,7 +119,7 @@ class Machine:
             compensation=resumed.compensation,
             devices={"module": self.device},
             recorder=recorder,
-            publish=lambda name, sent: self.published.append((name, sent)),
+            publish=self.publish,
             clock=self.clock,
             first_sequence=first_sequence(self.recordings, MACHINE, self.clock.utc_ns(), 60.0),
             recordings=self.recordings,

@@ -61,6 +61,21 @@ def test_a_service_of_several_axes_from_its_file(machine: tuple[Path, VirtualClo
     assert audit(recordings(setup.recordings, "vmc-07")).samples == 5
 
 
+def test_an_error_of_a_listener_to_messages_ends_neither_a_sample_nor_an_event(
+    machine: tuple[Path, VirtualClock], caplog: pytest.LogCaptureFixture
+) -> None:
+    path, clock = machine
+    setup = load(str(path))
+
+    def fails(name: str, data: bytes) -> None:
+        raise KeyError(name)
+
+    asyncio.run(run_service(setup, clock=clock, samples=2, on_publish=fails))
+    audited = audit(recordings(setup.recordings, "vmc-07"))
+    assert audited.clean and audited.samples == 2
+    assert "internal error of a listener to published messages" in caplog.text
+
+
 def test_the_check_names_the_axes_and_what_the_model_has_beyond(
     machine: tuple[Path, VirtualClock], capsys: pytest.CaptureFixture[str]
 ) -> None:

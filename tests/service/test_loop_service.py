@@ -441,3 +441,25 @@ async def test_a_loop_that_is_off_says_what_to_set(tmp_path: Path) -> None:
     no = machine.at_sample[5] = Asked(machine, "dismiss")
     await machine.run(10)
     assert not no.answer["ok"] and 'policy = "propose" or "adopt"' in no.answer["text"], no.answer
+
+
+async def test_what_is_exchanged_stays_exchanged_whatever_fails_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The offset goes on with the model that the recordings, the store and the events name."""
+    machine = Looping(tmp_path, shown(extended()))
+    take = machine.publish
+
+    def fails(name: str, data: bytes) -> None:
+        take(name, data)
+        if name == "event" and b'"kind":"adopt"' in data:
+            raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(machine, "publish", fails)
+    await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    monkeypatch.setattr(machine, "publish", take)
+    await machine.run(30)
+    assert {one.offset.model_sha256 for one in machine.outcomes[-30:]} == {sha256_of(extended())}
+    assert machine.store.in_use() == extended()
+    assert ("adopt", "") in machine.steps() and "a defect" in machine.events("loop")[-1].text
+    checked(machine)

@@ -126,29 +126,32 @@ class LiveLoop:
 
     def before_sample(self, present: Compensation) -> Compensation:
         """Return the compensation for the next sample, after an exchange if one is due."""
+        in_force = [present]
 
-        def again(core: ModelLoop) -> Compensation:
+        def again(core: ModelLoop) -> None:
             core.drop_ended()
             self._journal.start_new_file()
-            return present
 
-        return self._guarded(lambda core: self._changed(core, present), present, again=again)
+        # What has been exchanged stays exchanged, whatever fails after it.
+        self._guarded(lambda core: self._change(core, in_force), None, again=again)
+        return in_force[-1]
 
-    def _changed(self, core: ModelLoop, present: Compensation) -> Compensation:
-        """Let what has ended go, what is warmed up begin, and an exchange happen."""
+    def _change(self, core: ModelLoop, in_force: list[Compensation]) -> None:
+        """Let what has ended go, what is warmed up begin, and an exchange happen, which adds what is in force then."""
+        present = in_force[-1]
         if core.drop_ended():
             self._journal.start_new_file()
         warmed = self._warming
         if warmed is not None and core.is_free:
             self._begin_shadow(core, warmed)
         if not (core.state.exchange and self._storing.is_done):
-            return present
+            return
         new, self._model, notes = core.exchange(present, self._model, present.status.time_utc_ns)
+        in_force.append(new)
         self._storing.is_done = False
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._note(notes)
-        return new
 
     def _begin_shadow(self, core: ModelLoop, warmed: Found) -> None:
         ready = warmed.catch_up()
