@@ -35,8 +35,8 @@ NOW_H = 24.0
 #: Most decisions that are kept.
 MOST_STEPS = 500
 _KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
-#: After these there is no proposal: withdrawn, adopted or ended; another one is compared, or all begins anew.
-_NOT_PROPOSED = (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END, LoopAction.SHADOW, LoopAction.BACK)
+#: After these a candidate is proposed no longer.
+_NOT_PROPOSED = (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +158,9 @@ class _Summary:
         self._diagnoses = 0
         self._found: tuple[str, ...] = ()
         self._effects: tuple[str, ...] = ()
+        #: Effects of the proposal that stands, and the hash of its model.
         self._proposed: tuple[str, ...] = ()
+        self._proposed_sha256 = ""
         self._needs = ""
         self._steps: deque[tuple[str, str]] = deque(maxlen=MOST_STEPS)
 
@@ -193,9 +195,9 @@ class _Summary:
         if step == LoopAction.SHADOW:
             self._found = effects
         if step == LoopAction.PROPOSE:
-            self._proposed = effects
-        elif step in _NOT_PROPOSED and not (step == LoopAction.END and data.get("role") == "before"):
-            self._proposed = ()
+            self._proposed, self._proposed_sha256 = effects, data.get("model_sha256", "")
+        elif step in _NOT_PROPOSED and data.get("model_sha256", "") == self._proposed_sha256:
+            self._proposed, self._proposed_sha256 = (), ""
         if step in (LoopAction.ADOPT, LoopAction.BACK):
             self._effects = effects
 

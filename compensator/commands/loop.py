@@ -84,7 +84,7 @@ def _row(one: MachineLoop) -> FleetRow:
     from compensator.report.fleet import FleetRow
 
     if one.error:
-        return FleetRow(name=Path(one.folder).name, needs=f"check its recordings: {one.error}", is_bad=True)
+        return FleetRow(name=one.folder, needs=f"check its recordings: {one.error}", is_bad=True)
     now = "–" if one.now_um is None else f"{one.now_um:.1f}"
     error = now if one.first_um is None else f"{one.first_um:.1f} → {now}"
     measured = {"sensor": "", "probe": " (probes)", "": ""}[one.measured_by]

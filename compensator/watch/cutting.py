@@ -76,6 +76,9 @@ def headline(
     """
     words = partial(_words, is_proposed=is_proposed)
     found = _headline(shown, tone, reasons, channels, until_ns, now_ns, warnings, words)
+    if is_proposed and found.cut == "yes":
+        # Measured Y speaks against the model that it follows.
+        found = Headline("care", "Cut with care", f"{found.text} {_ANSWER}")
     if found.cut == "no" or std_um is None:
         return found
     return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")

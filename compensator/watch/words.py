@@ -156,7 +156,7 @@ def loop_text(loop: Mapping[str, Any]) -> str:
     effects = ", ".join(loop["effects"]) or "no added effect"
     why = f"{loop['text'][:1].upper()}{loop['text'][1:]}"
     words = {
-        "idle": "Model: nothing better is known.",
+        "idle": "Model: no other one is compared with it.",
         "shadow": f"Model: a candidate with {effects} runs beside the present one. {why}.",
         "proposed": f"Model: one that has shown itself better is proposed, with {effects}. Now: {loop['text']}.",
         "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {why}.",

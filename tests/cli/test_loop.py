@@ -19,11 +19,12 @@ LOOP = b'\n[loop]\npolicy = "propose"\n'
 BETTER = ComparisonData(
     verdict=ComparisonVerdict.BETTER, measured_by="sensor", hours=12.0, present_rms_um=6.0, candidate_rms_um=1.0
 )
+PROPOSED = LoopData(step=LoopAction.PROPOSE, effects=["gain:DTF"], model_sha256="a" * 64, comparison=BETTER)
 #: What a loop did: minute, kind, text, data.
 TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
     (60, "diagnosis", "found", DiagnosisData(verdict="explained", effects=["gain:DTF"]).table()),
     (60, "loop", "begins", LoopData(step=LoopAction.SHADOW, effects=["gain:DTF"], role="candidate").table()),
-    (300, "loop", "proposed", LoopData(step=LoopAction.PROPOSE, effects=["gain:DTF"], comparison=BETTER).table()),
+    (300, "loop", "proposed", PROPOSED.table()),
 )
 
 
@@ -69,12 +70,17 @@ def test_decisions_of_a_machine_with_a_loop_are_those_of_its_recordings(
 @pytest.mark.parametrize(
     ("after", "proposed"),
     [
-        (LoopData(step=LoopAction.WITHDRAW, role="candidate"), []),
-        (LoopData(step=LoopAction.SHADOW, role="candidate", effects=["delay:DTF"]), []),
-        (LoopData(step=LoopAction.END, role="before", why="watched"), ["gain:DTF"]),
+        (LoopData(step=LoopAction.WITHDRAW, role="candidate", model_sha256="a" * 64), []),
+        (LoopData(step=LoopAction.END, role="candidate", model_sha256="a" * 64, why="by_hand"), []),
+        (
+            LoopData(step=LoopAction.SHADOW, role="candidate", model_sha256="b" * 64, effects=["delay:DTF"]),
+            ["gain:DTF"],
+        ),
+        (LoopData(step=LoopAction.END, role="candidate", model_sha256="b" * 64, why="worse"), ["gain:DTF"]),
+        (LoopData(step=LoopAction.END, role="before", model_sha256="c" * 64, why="watched"), ["gain:DTF"]),
     ],
 )
-def test_a_proposal_asks_something_of_a_person_until_it_is_withdrawn_or_another_candidate_comes(
+def test_a_proposal_asks_something_of_a_person_whatever_happens_to_other_models(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], after: LoopData, proposed: list[str]
 ) -> None:
     told = (*TOLD, (350, "loop", "after it", after.table()))
@@ -140,6 +146,8 @@ def test_a_shop_is_a_folder_of_folders_and_one_bad_machine_stops_no_other(
     assert "2 machine(s): action needed on 2, 1 of them with a proposal; 1 could not be read." in text
     assert "torn.mcap" in text and str(page) in text
     shown = page.read_text(encoding="utf-8")
+    # Folders of recordings often have the same name.
+    assert str(bad) in text and str(bad) in shown
     assert "gain:DTF" in shown and "Failed" in shown
 
 

@@ -72,6 +72,18 @@ def test_a_change_from_a_broken_couple_is_no_success():
     assert days_page([made(loop_um=made().first_um * 1.1)]).tone == "warn"
 
 
+def test_days_on_which_the_loop_does_harm_are_said():
+    worse = made(loop_um=np.where(T_H > 216.0, 6.0, made().loop_um))
+    text = days_verdict([worse])
+    assert text.endswith("on the machine with a displacement sensor: day 10 (6.0 instead of 5.0 µm).")
+    assert days_page([worse]).tone == "warn" and "Worse" not in days_verdict([made()])
+
+
+def test_the_table_says_when_an_effect_begins_and_ends():
+    table = days_table([made()]).text()
+    assert "bearing from hour 2 " in table and "bearing until hour 2, fan motor " in table
+
+
 @pytest.fixture(scope="module")
 def short():
     """The record of one day of the demo, with its effects at the hours 6 to 18 and from 12 on."""

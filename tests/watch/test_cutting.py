@@ -103,3 +103,11 @@ def test_while_the_service_proposes_a_model_nobody_is_sent_to_look_for_one() -> 
     found = headline(**given, until_ns=None, now_ns=NOW_NS, is_proposed=True)
     assert "diagnose" not in found.text and found.text.endswith("answer the proposal.")
     assert "`compensator diagnose`" in headline(**given, until_ns=None, now_ns=NOW_NS).text
+
+
+def test_no_machine_is_all_well_while_measured_y_speaks_against_its_model() -> None:
+    """With probes, which correct the present model, no other reason shows it."""
+    well: dict[str, Any] = {"shown": "ok", "tone": "good", "reasons": [], "channels": {}, "until_ns": None}
+    assert headline(**well, now_ns=NOW_NS).cut == "yes"
+    found = headline(**well, now_ns=NOW_NS, is_proposed=True)
+    assert found.cut == "care" and found.text.endswith("answer the proposal.")

@@ -212,7 +212,7 @@ class Loop:
         notes = decide_exchange(self.state, "adopt", place, self.compared)
         text = f"a better model is adopted: {_named(place)}; {described(place.verdict)}"
         if self.state.level_um:
-            text += f"; its level is raised by {self.state.level_um:+.1f} µm to that of measured Y"
+            text += f"; its level is shifted by {self.state.level_um:+.1f} µm, to that of measured Y"
         return [*notes, note_of(self.state, place, LoopAction.ADOPT, text)]
 
     def _propose(self, place: Place, choice: Choice) -> list[Note]:
