@@ -25,7 +25,7 @@ from compensator.recording.reading import in_order, recordings_in
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.run import LoopRun
 from compensator.service.probing import ReceivedProbe
-from compensator.service.replay import RecordedStep, execute, setup_of, steps_of
+from compensator.service.replay import RecordedStep, execute, setup_of, steps_in
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import RecordedRun
 
@@ -68,6 +68,8 @@ class MachineLoop:
         Time and text of the last decisions.
     error : str
         Why the recordings cannot be used.
+    cut : tuple of str
+        Files without their end, but for the newest: the service was killed, or they are damaged, which `replay` tells.
     """
 
     folder: str
@@ -87,6 +89,7 @@ class MachineLoop:
     needs: str = ""
     steps: tuple[tuple[str, str], ...] = ()
     error: str = ""
+    cut: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return it for `--json`."""
@@ -115,19 +118,19 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
         contents = container.survey(whole=False)
         config, model = setup_of(contents, paths[-1].name)
         file = contents.attachments["model.toml"].data
-    summary = _Summary(str(folder), config.machine.name)
+    summary, cut = _Summary(str(folder), config.machine.name), list[str]()
     if config.loop is not None and config.loop.is_on:
-        for step in _steps(paths):
+        for step in _steps(paths, cut):
             summary.add_events((event.kind, event.text, event.data, event.time_utc_ns) for event in step.events)
             if step.estimate is not None and step.offset is not None:
                 summary.add(step.estimate, step.offset, [probe for _, probe in step.probes])
-        return summary.result(is_recorded=True)
+        return dataclasses.replace(summary.result(is_recorded=True), cut=tuple(cut))
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
     config = msgspec.structs.replace(config, loop=Loop(policy=policy))
     alone, followed = _Summary("", ""), _Followed(LoopRun(config, file, diagnosis_in_process(config)))
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
-    for step in _steps(paths):
+    for step in _steps(paths, cut):
         outcome, first = of_loop.process(step), of_first.process(step)
         if outcome is not None:
             at_ns = outcome.sample.time_utc_ns
@@ -135,12 +138,16 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
             summary.add(outcome.estimate, outcome.offset, outcome.probes)
         if first is not None:
             alone.add(first.estimate, first.offset, first.probes)
-    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um)
+    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um, cut=tuple(cut))
 
 
-def _steps(paths: Sequence[Path]) -> Iterator[RecordedStep]:
+def _steps(paths: Sequence[Path], cut: list[str]) -> Iterator[RecordedStep]:
+    """Yield the groups of all files; `cut` gets those that end without their end, but for the newest."""
     for path in paths:
-        yield from steps_of(path)
+        with Container(path) as container:
+            yield from steps_in(container)
+            if path != paths[-1] and not container.contents.ended:
+                cut.append(path.name)
 
 
 # ---------------------------------------------------------------------- what came out

@@ -88,9 +88,10 @@ def _row(one: MachineLoop) -> FleetRow:
     now = "–" if one.now_um is None else f"{one.now_um:.1f}"
     error = now if one.first_um is None else f"{one.first_um:.1f} → {now}"
     measured = {"sensor": "", "probe": " (probes)", "": ""}[one.measured_by]
+    cut = f", {len(one.cut)} file(s) without their end: {', '.join(one.cut)}" if one.cut else ""
     return FleetRow(
         name=one.machine,
-        span=f"{one.from_utc[:10]} to {one.to_utc[:10]}, {'its own loop' if one.is_recorded else 'computed now'}",
+        span=f"{one.from_utc[:10]} to {one.to_utc[:10]}, {'its own loop' if one.is_recorded else 'computed now'}{cut}",
         error=f"{error}{measured}",
         found=", ".join(one.found) or "nothing",
         proposed=", ".join(one.proposed),

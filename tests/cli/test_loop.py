@@ -169,3 +169,15 @@ def test_processes_of_their_own_find_what_one_process_finds(
         found.append(result([str(told), str(tmp_path / "second")], capsys))
     assert found[0] == found[1]
     assert [one["machine"] for one in found[0]] == ["vmc-07", "vmc-07"]
+
+
+def test_a_file_without_its_end_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What it lacks may be a decision; the newest file has no end while the service runs."""
+    folder = recorded(tmp_path / "live", 200, config=CONFIG + LOOP)
+    recorded(folder, 200, config=CONFIG + LOOP)
+    last, first = sorted(folder.glob("*.mcap"))  # -001 is the second one
+    for path in (last, first):
+        assert result([str(folder)], capsys)[0]["cut"] == []
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert main(["loop", str(folder)]) == 0
+    assert f"1 file(s) without their end: {first.name}" in capsys.readouterr().out

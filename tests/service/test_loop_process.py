@@ -79,7 +79,7 @@ async def test_what_it_finds_comes_with_the_model_and_the_page_stays(tmp_path: P
             "(folder / 'result.json').write_text(json.dumps({'verdict': 'explained', 'effects': ['input:a']}))",
             "cannot be read",
         ),
-        ("(folder / 'result.json').write_bytes(b' ' * 3_000_000)", "larger than"),
+        ("(folder / 'result.json').write_bytes(b' ' * 11_000_000)", "larger than"),
         ("raise SystemExit(3)", "ended with code 3"),
         ("os.kill(os.getpid(), 9)", "ended by SIGKILL"),
         ("(folder / 'result.json').write_bytes(bytes(range(128, 256)))", "cannot be read"),

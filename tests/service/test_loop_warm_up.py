@@ -9,9 +9,9 @@ import pytest
 from compensator.codes import Reason
 from compensator.model.model_file import parse_model
 from compensator.service.compensation import Compensation
-from compensator.service.loop.core import is_rest, warmed_on
+from compensator.service.loop.core import warmed_on
 from compensator.service.loop.shadow import Shadow
-from compensator.service.outcome import Outcome
+from compensator.service.outcome import Outcome, sets_zero_at_rest
 from tests.service.looping import extended, machine, settings, stronger
 
 RECORD = 3000
@@ -38,7 +38,7 @@ def predicted(compensation: Compensation) -> float:
 
 def test_a_candidate_counts_its_channel_from_the_zero_at_rest_before_the_record(record: list[Outcome]) -> None:
     model = parse_model(extended(3.0), source="candidate")
-    (at_rest,) = [outcome for outcome in record if is_rest(outcome)]
+    (at_rest,) = [outcome for outcome in record if sets_zero_at_rest(outcome)]
     whole = warmed_on(settings(), model, record)
     short = warmed_on(settings(), model, record[-RECORD:], at_rest)
     assert predicted(short) == pytest.approx(predicted(whole), abs=0.3)

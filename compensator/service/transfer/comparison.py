@@ -86,6 +86,9 @@ class ComparisonState(msgspec.Struct, kw_only=True):
         Begin of the first compared value and time of the last sample, ns since 1970 UTC; 0 before.
     suspected, steps, still : int
         Samples with measured Y while a sensor was suspected; steps of Y, and those of them without any change.
+    suspected_squares : tuple of two floats
+        Sums of squares of the residuals of both models in the samples that a sensor was suspected in, µm²: shown, and
+        judged by nobody.
     y_um : float, optional
         The last measured Y.
     model_ns : int
@@ -103,6 +106,7 @@ class ComparisonState(msgspec.Struct, kw_only=True):
     suspected: int = 0
     steps: int = 0
     still: int = 0
+    suspected_squares: tuple[float, float] = (0.0, 0.0)
     y_um: float | None = None
     model_ns: int = 0
 
@@ -157,7 +161,10 @@ class Comparison:
         ]
         state, is_measured, now_ns = self.state, math.isfinite(sum(residuals)), present.sample.time_utc_ns
         if suspected:
-            state.suspected += is_measured
+            if is_measured:
+                state.suspected += 1
+                own, other = state.suspected_squares
+                state.suspected_squares = own + own_um**2, other + other_um**2
             return False
         if not (probes or is_measured):
             return False
@@ -268,8 +275,12 @@ class Comparison:
     def _by_sensor(self, deviations: float) -> ComparisonData:
         state, blocks = self.state, self._blocks()
         samples = sum(block.samples for block in blocks)
+        if not samples and state.suspected:
+            own_rms, other_rms = (math.sqrt(square / state.suspected) for square in state.suspected_squares)
+            shown = not_judged(NotJudged.SUSPECT)
+            return changed(shown, measured_by="sensor", present_rms_um=own_rms, candidate_rms_um=other_rms)
         if not samples:
-            return not_judged(NotJudged.SUSPECT if state.suspected else NotJudged.NO_Y)
+            return not_judged(NotJudged.NO_Y)
         own_rms, other_rms = _about_zero(blocks, self._fewest)
         scores = ComparisonData(
             verdict=ComparisonVerdict.NOT_JUDGED,
