@@ -1054,7 +1054,8 @@ SUFFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         f"{Reason.IMPLAUSIBLE}:model": (
             "Measured and predicted Y diverge, and no sensor explains it: the model lacks an effect.",
-            "Run `compensator diagnose` on the recordings, then `compensator adopt`.",
+            "With `[loop]` the service looks for it; else run `compensator diagnose` on the recordings, then "
+            "`compensator adopt`.",
         ),
         f"{Reason.SUSPECT_CHANNEL}:t_q_degc": (
             "T_Q has jumped and is not used until it returns, or until the model or measured Y agrees with it.",

@@ -43,6 +43,10 @@ def run(arguments: argparse.Namespace) -> Answer:
             f"\nprobes: on, one value ±{probe.std_um:g} µm, at most {probe.measured_max_um:g} µm, correction at most "
             f"{probe.largest_um:g} µm, tolerance {tolerance}"
         )
+    if config.loop is not None:
+        loop = config.loop
+        when = f", a diagnosis at {loop.at_utc} UTC and every {loop.every_h} h" if loop.is_on else " (loop.policy)"
+        text += f"\nloop: {loop.policy}{when}"
     result = {
         "ok": True,
         "machine": machine,

@@ -113,3 +113,26 @@ def test_the_example_configuration_is_good(capsys: pytest.CaptureFixture[str]) -
 
     assert main(["check", "--config", str(ROOT / "deploy/machine.example.toml")]) == 0
     assert "Nothing was opened" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("", None),
+        ("[loop]\n", "\nloop: off (loop.policy)\n"),
+        (
+            '[loop]\npolicy = "propose"\nat_utc = "03:30"\n',
+            "\nloop: propose, a diagnosis at 03:30 UTC and every 6 h\n",
+        ),
+    ],
+)
+def test_the_check_says_whether_the_service_looks_for_better_models(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, said: str | None
+) -> None:
+    from compensator.cli import main
+
+    path = tmp_path / "machine.toml"
+    path.write_text((ROOT / "deploy/machine.example.toml").read_text(encoding="utf-8") + table, encoding="utf-8")
+    assert main(["check", "--config", str(path)]) == 0
+    found = capsys.readouterr().out
+    assert said in found if said else "loop" not in found

@@ -45,7 +45,7 @@ def test_a_missing_temperature_whose_last_known_quality_was_good_is_not_called_g
         ("hold", ("operator_hold",), "no", "Send the command resume."),
         ("hold", ("outside_validity:at_degc",), "no", "AT is outside the range in which the machine was calibrated."),
         ("degraded", ("implausible:y_um",), "care", "Check the displacement sensor"),
-        ("degraded", ("implausible:model",), "care", "Run `compensator diagnose`"),
+        ("degraded", ("implausible:model",), "care", "run `compensator diagnose`"),
         ("degraded", ("rate_limited",), "care", "Wait;"),
     ],
 )
