@@ -65,7 +65,7 @@ class Channel(_Table, frozen=True, kw_only=True):
     The limits are optional for auxiliary channels and required for T_Q, AT and Y.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$", examples=["t_q_degc", "coolant_degc"])]
     device: Text
     input: Annotated[int, Meta(ge=0, le=65535)]
     range: tuple[float, float] | None = None
@@ -193,7 +193,7 @@ class Loop(_Table, frozen=True, kw_only=True):
     """
 
     policy: Literal["off", "propose", "adopt"] = "off"
-    at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "02:00"
+    at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", examples=["02:00", "14:30"])] = "02:00"
     every_h: Literal[4, 6, 8, 12, 24] = 6
     misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 3.0
     record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
@@ -225,7 +225,9 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     by default only on loopback without TLS.
     """
 
-    prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", max_length=200)]
+    prefix: Annotated[
+        str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", max_length=200, examples=["shop/vmc-07"])
+    ]
     mode: Literal["peer", "client", "router"] = "peer"
     listen: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
     connect: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
@@ -410,13 +412,22 @@ def _keys_at(where: str) -> list[str]:
     return [field.encode_name for field in msgspec.structs.fields(_table_in(_type_at(where)))]
 
 
-def _choices_at(where: str) -> list[Any]:
-    """Return what a value may be that is one of a few; nothing for any other value."""
+def _expected_at(where: str, text: str) -> str:
+    """Return what a value may be, in words; `text`, as it was refused, where nothing else is known."""
     try:
         types = _types_in(_type_at(where))
     except (KeyError, ValueError):  # a name that the user gave, such as a channel's
-        return []
-    return [choice for one in types if get_origin(one) is Literal for choice in get_args(one)]
+        return text
+    if choices := [str(choice) for one in types if get_origin(one) is Literal for choice in get_args(one)]:
+        return f"expected one of: {', '.join(choices)}"
+    for meta in (one for one in types if isinstance(one, Meta)):
+        if "regex" in text and meta.examples:
+            return f"expected such as {' or '.join(meta.examples)}"
+        sides = (("at least", meta.ge), ("more than", meta.gt), ("at most", meta.le), ("less than", meta.lt))
+        bounds = [f"{words} {side:g}" for words, side in sides if side is not None]
+        if bounds and re.fullmatch(r"Expected `(int|float)` [<>]=? \S+", text):
+            return f"expected {' and '.join(bounds)}"
+    return text
 
 
 def _types_in(annotation: Any) -> list[Any]:
@@ -445,9 +456,7 @@ def _in_words(message: str, table: object) -> str:
             value = None
             break
     shown = "" if value is None or isinstance(value, (dict, list)) else f" = {repr(value)[:60]}"
-    if choices := _choices_at(where):
-        text = f"expected one of: {', '.join(map(str, choices))}"
-    return f"{where}{shown}: {text}"
+    return f"{where}{shown}: {_expected_at(where, text)}"
 
 
 def _check(config: Config) -> None:

@@ -223,7 +223,7 @@ def test_every_number_of_a_configuration_has_a_smallest_and_a_largest_value() ->
 def test_optional_limits_have_a_smallest_value(line: str) -> None:
     text = CONFIG.decode().replace("guards.t_q_below_at_max_k = 2.0\n", "") if "guards" in line else CONFIG.decode()
     parse_config(f"{line.replace('TINY', '1.0')}\n{text}".encode(), source="c.toml")
-    with pytest.raises(ConfigError, match=r"^c\.toml: .* = 5e-324: Expected `float` >= 0\.0"):
+    with pytest.raises(ConfigError, match=r"^c\.toml: .* = 5e-324: expected at least \d"):
         parse_config(f"{line.replace('TINY', '5e-324')}\n{text}".encode(), source="c.toml")
 
 
@@ -359,7 +359,7 @@ def test_a_device_is_no_token(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("limit", ["keep_days", "keep_mb"])
 def test_a_history_of_no_length_is_a_slip_of_the_pen(limit: str) -> None:
-    with pytest.raises(ConfigError, match=rf"recording.{limit} = 5e-324: Expected `float` >= 1"):
+    with pytest.raises(ConfigError, match=rf"recording.{limit} = 5e-324: expected at least 1 and"):
         parse_config(
             CONFIG.replace(b"recording.folder", f"recording.{limit} = 5e-324\nrecording.folder".encode()),
             source="c.toml",

@@ -202,3 +202,21 @@ def test_what_is_no_file_is_not_written_to_and_a_link_stays_one(tmp_path: Path) 
     with atomic_write(link) as file:
         file.write("after\n")
     assert link.is_symlink() and kept.read_text() == "after\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('at_utc = "2:00"', "loop.at_utc = '2:00': expected such as 02:00 or 14:30"),
+        ("record_h = 2", "loop.record_h = 2: expected at least 6 and at most 336"),
+        ("every_h = 5", "loop.every_h = 5: expected one of: 4, 6, 8, 12, 24"),
+        ('shadow_h = "a day"', "loop.shadow_h = 'a day': Expected `float`, got `str`"),
+    ],
+)
+def test_a_value_that_cannot_be_says_what_can(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, expected: str
+) -> None:
+    example = Path(__file__).parents[2] / "deploy/machine.example.toml"
+    path = tmp_path / "machine.toml"
+    path.write_text(f"{example.read_text(encoding='utf-8')}\n[loop]\n{line}\n", encoding="utf-8")
+    refused(capsys, ["check", "--config", str(path)], expected)
