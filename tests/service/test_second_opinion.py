@@ -89,11 +89,20 @@ async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by
         assert figure in answer["text"]
     assert "the offset would move by" in answer["text"] and "\n" not in answer["text"]
     assert forced.answer["ok"] and forced.answer["comparison"]["verdict"] == "worse"
+    assert "is adopted with the next sample against measured Y, " in forced.answer["text"]
+    assert "against measured Y" not in back.answer["text"]
     # The way back is better, and would not be refused in any case.
     assert back.answer["ok"] and back.answer["comparison"]["verdict"] == "better"
     # The recording carries the figures: refused, by force, back.
     events = [event for path in recordings(machine.recordings, MACHINE) for event in messages(path, ("event",))]
     told = [event.data for event in events if event.kind == "adopt"]
+    # What the offset would move by is said before it moves.
+    moves = [
+        (event.text.count("the offset moves"), event.text.count("would move"))
+        for event in events
+        if event.kind == "adopt"
+    ]
+    assert moves == [(0, 1), (1, 0), (1, 0)]
     assert [(data["ok"], data["comparison"]["verdict"]) for data in told] == [
         (False, "worse"), (True, "worse"), (True, "better"),
     ]  # fmt: skip
@@ -223,6 +232,8 @@ async def test_a_suspected_sensor_judges_no_model(tmp_path: Path) -> None:
     assert sum(suspected) > 450
     found = machine.opinion(QUILL, gain(0.4))
     assert (found.verdict, found.why) == ("not_judged", "suspect") and "suspected a sensor" in described(found)
+    # What both leave is shown all the same.
+    assert found.present_rms_um is not None and f"present {found.present_rms_um:.1f} µm rms" in described(found)
 
 
 async def test_temperatures_that_measured_y_has_shown_to_be_right_keep_no_model_unjudged(tmp_path: Path) -> None:

@@ -233,13 +233,11 @@ class LiveLoop:
         if candidate is None:
             raise ServiceError("there is no candidate now; see `compensator watch`")
         words = f"{candidate.sha256[:12]} ({named(candidate.effects)})"
-        if not candidate.is_proposed and not force:
-            raise ServiceError(
-                f"candidate {words} is not proposed yet: {described(candidate.verdict)}; wait, or use --force"
-            )
         assert self._core is not None
-        moves_um = self._core.offset_change_um(present)
-        return Offer(candidate.sha256, words, changed(candidate.verdict, offset_change_um=moves_um))
+        verdict = changed(candidate.verdict, offset_change_um=self._core.offset_change_um(present))
+        if not candidate.is_proposed and not force:
+            raise ServiceError(f"candidate {words} is not proposed yet: {described(verdict)}; wait, or use --force")
+        return Offer(candidate.sha256, words, verdict)
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""

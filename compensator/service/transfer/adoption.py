@@ -33,7 +33,13 @@ from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
 from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
-from compensator.service.transfer.second_opinion import described, refuse_if_worse, second_opinion
+from compensator.service.transfer.second_opinion import (
+    described,
+    is_forced,
+    refuse_if_worse,
+    second_opinion,
+    without_move,
+)
 from compensator.service.transfer.turns import give_way
 
 log = logging.getLogger("compensator")
@@ -196,7 +202,7 @@ class Adoption:
         self._events.note(
             EventKind.ADOPT,
             f"model {named[0]} replaces {named[1]}, warm-up {candidate.minutes / 60.0:.1f} h, "
-            f"the offset moves by {difference:+.2f} µm; {described(comparison)}{_unwatched(new, old)}",
+            f"the offset moves by {difference:+.2f} µm; {described(without_move(comparison))}{_unwatched(new, old)}",
             {
                 "ok": True,
                 "action": order.action,
@@ -241,8 +247,8 @@ class Adoption:
         order.reply.set_result(
             {
                 "ok": True,
-                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}; "
-                + described(comparison),
+                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample"
+                f"{' against measured Y' if is_forced(comparison) else ''}, {how}; {described(comparison)}",
                 "model": model.name,
                 "model_sha256": model.sha256,
                 **candidate.figures(),

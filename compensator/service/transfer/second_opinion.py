@@ -81,7 +81,7 @@ def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) 
     ServiceError
         With the figures and what to do.
     """
-    worse = {axis: one for axis, one in found.by_axis().items() if one.verdict == ComparisonVerdict.WORSE}
+    worse = _worse(found)
     if not worse or force:
         return
     names = " and ".join(map(label_of, worse))
@@ -90,6 +90,22 @@ def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) 
         f"model {model.name} ({model.sha256[:12]}) is clearly worse{f' on {names}' if found.axes else ''}: {said}; "
         f"check that it is a model of this machine and that measured {names} is right, or use --force"
     )
+
+
+def _worse(found: ComparisonData) -> dict[str, ComparisonData]:
+    """Return the axes on which a model is clearly worse."""
+    return {axis: one for axis, one in found.by_axis().items() if one.verdict == ComparisonVerdict.WORSE}
+
+
+def is_forced(found: ComparisonData) -> bool:
+    """Return whether a model that is taken over all the same is clearly worse on an axis."""
+    return bool(_worse(found))
+
+
+def without_move(found: ComparisonData) -> ComparisonData:
+    """Return a comparison without what the offset would have moved by: it has moved, the correction included."""
+    axes = {axis: changed(one, offset_change_um=None) for axis, one in found.axes.items()}
+    return changed(found, offset_change_um=None, axes=axes)
 
 
 def described(found: ComparisonData) -> str:
