@@ -79,23 +79,23 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
         ),
         views,
     )
-    left = np.full((7 + len(places), evidence.used.size), np.nan)
+    left = {name: np.full(evidence.used.size, np.nan) for name in (*_PREDICTED, *places)}
     searches = np.zeros(len(places), dtype=int)
     for done, (block, several) in enumerate(zip(blocks, predicted, strict=True), start=2):
         progress(done, len(blocks) + 1)
         searches += several.has
-        for i, one in enumerate(several.predicted):
-            left[i, block] = left_of_block(evidence, block, several.knows_zero, one)
+        for name, one in several.predicted.items():
+            left[name][block] = left_of_block(evidence, block, several.knows_zero, one)
     # Nothing is given the better of both: a rest without effects may be that of the effects, and go anywhere.
-    base, nothing = min(left[:2], left[2:4], key=lambda each: rms_of(each[1]))
-    named, whole, ceiling, *steps = left[4:]
+    alone, beside = ((left[f"base, {rest}"], left[f"nothing, {rest}"]) for rest in _RESTS)
+    base, nothing = min(alone, beside, key=lambda each: rms_of(each[1]))
     return HeldOut(
         base=base,
         nothing=nothing,
-        named=named,
-        whole=whole,
-        ceiling=ceiling,
-        steps=tuple(Step(rms_um=rms_of(s), searches=n) for s, n in zip(steps, searches.tolist(), strict=True)),
+        named=left["named"],
+        whole=left["whole"],
+        ceiling=left["ceiling"],
+        steps=tuple(Step(rms_um=rms_of(left[p]), searches=n) for p, n in zip(places, searches.tolist(), strict=True)),
     )
 
 
@@ -114,23 +114,28 @@ def zeros_known(points: Points) -> tuple[bool, ...]:
     return tuple(bool(np.any((first >= run.start) & (first < run.stop))) for run in runs)
 
 
+#: With the rest of a search without effects, and with that beside them.
+_RESTS = ("without effects", "beside effects")
+_PREDICTED = (*(f"{name}, {rest}" for rest in _RESTS for name in ("base", "nothing")), "named", "whole", "ceiling")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Predictions:
     """What a search in a part of the evidence predicts on every sample of all.
 
     Parameters
     ----------
-    predicted : tuple of numpy.ndarray, shape (n,)
-        Of the base's paths as they are and nothing, with the rest without effects; both again, the named effects,
-        effects and remainder, all channels, the first place, the first two, …, with the rest beside effects; µm, each
-        with the zeros and initial states that are most probable beside it.
+    predicted : dict of str or Place to numpy.ndarray, shape (n,)
+        By the names of `_PREDICTED`, µm, each with the zeros and initial states that are most probable beside it: the
+        base's paths as they are, and nothing, with each rest; with the rest beside effects also the named effects,
+        effects and remainder, and all channels. By each place what its effect and those of the places before it add.
     knows_zero : tuple of bool
         For each run whether it knows its zero.
     has : numpy.ndarray of int, shape (places,)
         1 where it found an effect of that place.
     """
 
-    predicted: tuple[Vector, ...]
+    predicted: dict[str | Place, Vector]
     knows_zero: tuple[bool, ...]
     has: Indices
 
@@ -148,12 +153,13 @@ def _predictions(
     rests: tuple[Rest, Rest],
 ) -> _Predictions:
     found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
-    steps, total = [], found.own_paths
+    added: dict[str | Place, Vector] = {}
+    total = found.own_paths
     for place in places:
         total = sum(
             (r for t, r in zip(found.terms, found.responses, strict=True) if t.hypothesis.place == place), total
         )
-        steps.append(total)
+        added[place] = total
     has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
     # An own error alone and one beside effects say nothing of each other.
     whole = found.named if found.is_own_error_alone else found.whole
@@ -161,10 +167,13 @@ def _predictions(
         own = found.remainder if found.is_own_error_alone else None
         whole = (own or own_error_alone(found.selection.before)).added
     beside, alone = (_Nuisances(found.search.points, rest).beside for rest in rests)
-    nothing = by_base(seen) + of_time, found.paths
-    added = (found.named, whole, found.ceiling, *steps)
+    added |= {"named": found.named, "whole": whole, "ceiling": found.ceiling}
+    nothing = {"base": by_base(seen) + of_time, "nothing": found.paths}
+    predicted = {name: beside(one) for name, one in added.items()}
+    for rest, completed in zip(_RESTS, (alone, beside), strict=True):
+        predicted |= {f"{name}, {rest}": completed(one) for name, one in nothing.items()}
     return _Predictions(
-        predicted=(*map(alone, nothing), *map(beside, (*nothing, *added))),
+        predicted=predicted,
         knows_zero=zeros_known(found.search.points),
         has=has,
     )

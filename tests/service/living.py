@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 
 from compensator.clock import VirtualClock
-from compensator.commands.run import Reporter
 from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
@@ -30,12 +29,11 @@ from compensator.service.loop.resuming import resume_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
-from compensator.service.systemd import ServiceManager
 from compensator.service.transfer.model_store import ModelStore, check_model
 from compensator.service.transfer.restart import resume
 from sim_hardware.physics import PublishedQuill, World
 from tests.service.promises import Promises
-from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config, working_day
+from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config, taking, working_day
 
 MACHINE = "vmc-07"
 
@@ -59,7 +57,7 @@ class Machine:
         self.device = FakeDevice([functools.partial(self.world.truth, name) for name in CHANNELS])
         self.outcomes: list[Outcome] = []
         self.published: list[tuple[str, bytes]] = []
-        self.reporter = Reporter(ServiceManager({}))
+        self._take = taking(self.published)
         self.at_sample: dict[int, Callable[[], Any]] = {}
         self.daemon: Daemon | None = None
 
@@ -77,9 +75,8 @@ class Machine:
         self.clock = VirtualClock(start_ns, advance)
 
     def publish(self, name: str, data: bytes) -> None:
-        """Take a message, as `compensator run` does after it was published."""
-        self.published.append((name, data))
-        self.reporter.report_message(name, data)
+        """Take a message."""
+        self._take(name, data)
 
     @property
     def recordings(self) -> Path:

@@ -34,7 +34,7 @@ from sim_hardware.physics import MachineOfAxes, PublishedQuill, World, usual_sen
 from sim_hardware.physics.axes import USUAL
 from tests.audit.made import CONFIG as ONE_AXIS
 from tests.service.promises import Promises
-from tests.service.simulated import START_NS, FakeDevice, working_day
+from tests.service.simulated import START_NS, FakeDevice, taking, working_day
 
 MACHINE = "vmc-07"
 CHANNELS = ("t_q_degc", "at_degc", "y_um", "coolant_degc", "x_um", "z_um")
@@ -177,7 +177,7 @@ class SeveralAxes:
                 topics=topics_of(probes=config.probe is not None, loop=False, axes=axes),
                 axes=axes,
             ),
-            publish=lambda name, sent: self.published.append((name, sent)),
+            publish=taking(self.published),
             clock=self.clock,
             first_sequence=first_sequence(self.folder / "rec", MACHINE, self.clock.utc_ns(), 60.0),
             recordings=self.folder / "rec",

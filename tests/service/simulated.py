@@ -9,11 +9,13 @@ from typing import Any
 import msgspec
 
 from compensator.clock import NS, VirtualClock
+from compensator.commands.run import Reporter
 from compensator.config import Config
 from compensator.model.model_file import load_model
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
+from compensator.service.systemd import ServiceManager
 from drivers.errors import DriverError
 from drivers.reading import Reading
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -102,6 +104,17 @@ class FakeDevice:
         return
 
 
+def taking(published: list[tuple[str, bytes]]) -> Callable[[str, bytes], None]:
+    """Return what takes messages as `compensator run` does after each was published: they are logged."""
+    reporter = Reporter(ServiceManager({}))
+
+    def take(name: str, data: bytes) -> None:
+        published.append((name, data))
+        reporter.report_message(name, data)
+
+    return take
+
+
 class Bench:
     """A daemon on a simulated machine, with everything it published."""
 
@@ -125,7 +138,7 @@ class Bench:
             compensation=Compensation(self.config, load_model(self.config.model.file)),
             devices={"module": self.device},
             recorder=self.recorder,
-            publish=lambda name, data: self.published.append((name, data)),
+            publish=taking(self.published),
             clock=self.clock,
             first_sequence=0,
         )
