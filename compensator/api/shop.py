@@ -118,19 +118,19 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
         contents = container.survey(whole=False)
         config, model = setup_of(contents, paths[-1].name)
         file = contents.attachments["model.toml"].data
-    summary, cut = _Summary(str(folder), config.machine.name), list[str]()
+    summary = _Summary(str(folder), config.machine.name)
     if config.loop is not None and config.loop.is_on:
-        for step in _steps(paths, cut):
+        for step in _steps(paths, summary.cut):
             summary.add_events((event.kind, event.text, event.data, event.time_utc_ns) for event in step.events)
             if step.estimate is not None and step.offset is not None:
                 summary.add(step.estimate, step.offset, [probe for _, probe in step.probes])
-        return dataclasses.replace(summary.result(is_recorded=True), cut=tuple(cut))
+        return summary.result(is_recorded=True)
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
     config = msgspec.structs.replace(config, loop=Loop(policy=policy))
     alone, followed = _Summary("", ""), _Followed(LoopRun(config, file, diagnosis_in_process(config)))
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
-    for step in _steps(paths, cut):
+    for step in _steps(paths, summary.cut):
         outcome, first = of_loop.process(step), of_first.process(step)
         if outcome is not None:
             at_ns = outcome.sample.time_utc_ns
@@ -138,7 +138,7 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
             summary.add(outcome.estimate, outcome.offset, outcome.probes)
         if first is not None:
             alone.add(first.estimate, first.offset, first.probes)
-    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um, cut=tuple(cut))
+    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um)
 
 
 def _steps(paths: Sequence[Path], cut: list[str]) -> Iterator[RecordedStep]:
@@ -170,6 +170,8 @@ class _Summary:
         self._proposed_sha256 = ""
         self._needs = ""
         self._steps: deque[tuple[str, str]] = deque(maxlen=MOST_STEPS)
+        #: Files without their end (`MachineLoop.cut`).
+        self.cut: list[str] = []
 
     def add(self, estimate: EstimateMessage, offset: Offset, probes: Iterable[Probe]) -> None:
         """Add a sample."""
@@ -243,6 +245,7 @@ class _Summary:
             gone_back=self._counts[LoopAction.BACK],
             needs=needs,
             steps=tuple(self._steps),
+            cut=tuple(self.cut),
         )
 
 

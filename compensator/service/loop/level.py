@@ -71,9 +71,10 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
     def forget_after(self, time_utc_ns: int) -> None:
         """Forget what is later than a time, ns since 1970 UTC: the clock was ahead."""
         last = time_utc_ns // BLOCK_NS
+        if self.number <= last:
+            return
         self.blocks = [block for block in self.blocks if block[0] <= last]
-        if self.number > last:
-            self.number, self.count, self.sum_um = 0, 0, 0.0
+        self.number, self.count, self.sum_um = 0, 0, 0.0
 
     def clear(self) -> None:
         """Begin anew: at a zero, or with another model."""

@@ -35,10 +35,10 @@ from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
 from compensator.service.transfer.second_opinion import (
     described,
-    is_forced,
     refuse_if_worse,
     second_opinion,
     without_move,
+    worse_axes,
 )
 from compensator.service.transfer.turns import give_way
 
@@ -248,7 +248,7 @@ class Adoption:
             {
                 "ok": True,
                 "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample"
-                f"{' against measured Y' if is_forced(comparison) else ''}, {how}; {described(comparison)}",
+                f"{' against measured Y' if worse_axes(comparison) else ''}, {how}; {described(comparison)}",
                 "model": model.name,
                 "model_sha256": model.sha256,
                 **candidate.figures(),

@@ -81,7 +81,7 @@ def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) 
     ServiceError
         With the figures and what to do.
     """
-    worse = _worse(found)
+    worse = worse_axes(found)
     if not worse or force:
         return
     names = " and ".join(map(label_of, worse))
@@ -92,14 +92,9 @@ def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) 
     )
 
 
-def _worse(found: ComparisonData) -> dict[str, ComparisonData]:
+def worse_axes(found: ComparisonData) -> dict[str, ComparisonData]:
     """Return the axes on which a model is clearly worse."""
     return {axis: one for axis, one in found.by_axis().items() if one.verdict == ComparisonVerdict.WORSE}
-
-
-def is_forced(found: ComparisonData) -> bool:
-    """Return whether a model that is taken over all the same is clearly worse on an axis."""
-    return bool(_worse(found))
 
 
 def without_move(found: ComparisonData) -> ComparisonData:
