@@ -270,6 +270,9 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
         Hash and name of the candidate's model file; empty if there is none.
     calibrated : bool
         Whether the candidate is the calibrated model itself.
+    without : str
+        The effect that the candidate, the present model otherwise, does not have: it may have ended. Nothing was
+        diagnosed then.
     same_effects : bool
         Whether the present model has the same effects.
     change_deviations : float, optional
@@ -294,6 +297,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     candidate_sha256: str = ""
     candidate: str = ""
     calibrated: bool = False
+    without: str = ""
     same_effects: bool = False
     change_deviations: float | None = None
     in_shadow: bool = False

@@ -192,7 +192,7 @@ class _Summary:
             if kind not in _KINDS:
                 continue
             self._steps.append((_utc(at_ns), text))
-            if kind == EventKind.DIAGNOSIS:
+            if kind == EventKind.DIAGNOSIS and not data.get("without"):
                 self._diagnoses += 1
                 self._needs = str(data.get("needs", "")) if data.get("verdict") not in _HEALTHY else ""
             elif kind == EventKind.LOOP:

@@ -21,7 +21,7 @@ from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import in_parallel
-from compensator.config import Channel, Config, Loop, parse_config
+from compensator.config import Channel, Config, Loop, Plausibility, parse_config
 from compensator.demo.calibration import PERIOD_S, calibrate
 from compensator.demo.day import START_NS
 from compensator.demo.machine import PROBE_RANGE_UM, TOUCH_STD_UM, configuration
@@ -48,6 +48,8 @@ PROBE_EVERY_MIN, PROBE_SEED = 60, 16
 LOOP = Loop(policy="adopt", every_h=24, misfit_h=3.0, record_h=24.0, shadow_h=6.0)
 #: The same with a probe each hour: a day of them names nothing.
 PROBED_LOOP = msgspec.structs.replace(LOOP, every_h=12, record_h=48.0)
+#: Measured and predicted Y that diverge begin a diagnosis, too.
+CHECKS = Plausibility(false_alarm_days=30.0)
 _KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: Lines of the simulated devices, which are not opened here.
 _LINES = {"rtu": "/dev/null", "tcp": 502, "plc": 503, "dcon": "/dev/null", "data": 10001, "command": 23}
@@ -133,7 +135,9 @@ def _config(name: str, *, is_probed: bool) -> Config:
     text = configuration(f"sim-{name}", _LINES, 7447, is_probed=is_probed)
     config = parse_config(text.encode(), source="demo")
     fan = Channel(name="fan_rpm", device="control", input=0)
-    return msgspec.structs.replace(config, loop=PROBED_LOOP if is_probed else LOOP, channel=[*config.channel, fan])
+    return msgspec.structs.replace(
+        config, loop=PROBED_LOOP if is_probed else LOOP, plausibility=CHECKS, channel=[*config.channel, fan]
+    )
 
 
 def _samples(

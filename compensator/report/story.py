@@ -115,7 +115,7 @@ class Story:
             self._add_decision(event)
         elif event.kind == EventKind.DIAGNOSIS:
             found = data_of(event, DiagnosisData)
-            if found is not None:
+            if found is not None and not found.without:
                 self.diagnoses[found.verdict] += 1
                 self.needs = found.needs
         elif event.kind == EventKind.COMMAND and command_of(event) in (CommandName.ADOPT, CommandName.BACK):

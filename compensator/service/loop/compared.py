@@ -40,8 +40,8 @@ class Compared:
         Length of a sample, s.
     present_error : ErrorBlocks
         Errors of the present model.
-    candidates : int
-        Number of candidates in shadow: they share the chance to be found better by accident.
+    alike : int
+        Number of models in shadow with its role: they share the chance to be found better by accident.
     y_drifted : bool
         Whether measured Y has moved by itself since the last zero: what is about the zero then shows no level.
     """
@@ -53,11 +53,11 @@ class Compared:
         period_s: float,
         present_error: ErrorBlocks,
         *,
-        candidates: int = 1,
+        alike: int = 1,
         y_drifted: bool = False,
     ) -> None:
         self._place, self._settings, self._present_error = place, settings, present_error
-        self._candidates, self._y_drifted = candidates, y_drifted
+        self._alike, self._y_drifted = alike, y_drifted
         self._period_s, self._comparison = period_s, Comparison(period_s, place.comparison)
 
     @property
@@ -93,8 +93,7 @@ class Compared:
         it is one case more by itself.
         """
         place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
-        cases = self._candidates + has_taken_over if place.role == "candidate" else 1
-        wanted = shared(self._settings.deviations, cases)
+        wanted = shared(self._settings.deviations, self._alike + has_taken_over)
         place.verdict = self._comparison.verdict(deviations=wanted)
         if has_taken_over:
             own = self._comparison.of_itself().verdict(deviations=wanted)

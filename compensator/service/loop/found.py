@@ -16,7 +16,7 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.shadow import Shadow
-from compensator.service.loop.weighing import Weighed, failed
+from compensator.service.loop.weighing import Weighed, failed, without_effect
 from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.turns import give_way
@@ -91,14 +91,17 @@ class Found:
         return compensation, errors
 
 
-async def diagnosed(core: ModelLoop, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:
-    """Make the diagnosis that the loop wants; what goes wrong is a diagnosis that failed."""
+async def diagnosed(core: ModelLoop, present: bytes, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:
+    """Make the diagnosis that the loop wants; what goes wrong is a diagnosis that failed.
+
+    `present` is the file of the present model: it may be wanted without one of its effects.
+    """
     wanted = core.loop.wanted
     assert wanted is not None
     began_ns = clock.utc_ns()
     try:
         calibrated = await asyncio.to_thread(store.calibrated)
-        found = await diagnose(wanted, calibrated)
+        found = without_effect(present, wanted.without) if wanted.without else await diagnose(wanted, calibrated)
         weighed = await asyncio.to_thread(core.weigh, found, calibrated=calibrated)
     except CompensatorError as error:
         found = failed(str(error))

@@ -342,7 +342,7 @@ class LiveLoop:
     # ------------------------------------------------------------------ tasks
 
     async def _make_diagnosis(self, core: ModelLoop) -> None:
-        self._found = await diagnosed(core, self._diagnose, self._store, self._clock)
+        self._found = await diagnosed(core, self._model, self._diagnose, self._store, self._clock)
         self._task = None
 
     async def _warm_up(self, found: Found, data: bytes) -> None:

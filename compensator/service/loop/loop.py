@@ -58,11 +58,15 @@ CLEAN_MIN = BLOCK_MIN
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartDiagnosis:
-    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC."""
+    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC.
+
+    With `without` it is none: the present model without this effect is wanted.
+    """
 
     from_utc_ns: int
     to_utc_ns: int
     why: str
+    without: str = ""
 
 
 class Loop:
@@ -94,14 +98,16 @@ class Loop:
         running = self.state.diagnosis
         if running is None or running.candidate_sha256:
             return None
-        return StartDiagnosis(from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why)
+        return StartDiagnosis(
+            from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why, without=running.without
+        )
 
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
         state = self.state
-        count = max(len(state.candidates), 1)
+        alike = sum(one.role == place.role for one in state.taken)
         has_drifted = state.y_drifted_ns > 0
-        return Compared(place, self._settings, self._period_s, state.error, candidates=count, y_drifted=has_drifted)
+        return Compared(place, self._settings, self._period_s, state.error, alike=max(alike, 1), y_drifted=has_drifted)
 
     # ------------------------------------------------------------------ one sample
 
@@ -229,7 +235,9 @@ class Loop:
 
     def _go_back(self, place: Place) -> list[Note]:
         notes = decide_exchange(self.state, "back", place, self.compared)
-        text = f"back to the model before, which is better: {_named(place)}; {described(place.verdict)}"
+        ended = [one for one in self.state.effects if one not in place.effects]
+        to = "the model before" if place is self.state.watched else f"the model without {named(ended)}"
+        text = f"back to {to}, which is better: {_named(place)}; {described(place.verdict)}"
         return [*notes, note_of(self.state, place, LoopAction.BACK, text)]
 
     # ------------------------------------------------------------------ diagnoses

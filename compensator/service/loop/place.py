@@ -38,8 +38,8 @@ def remembered_h(settings: LoopSettings, role: Role) -> float:
 
 
 def role_of(found: DiagnosisData) -> Role:
-    """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
-    return "before" if found.calibrated else "candidate"
+    """Return the role of a candidate: to the calibrated model, or without an effect, the service goes back."""
+    return "before" if found.calibrated or found.without else "candidate"
 
 
 def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, now_ns: int) -> str:

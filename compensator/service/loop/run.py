@@ -20,7 +20,7 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop, warmed_on
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
-from compensator.service.loop.weighing import Diagnosed, effect_names, failed
+from compensator.service.loop.weighing import Diagnosed, effect_names, failed, without_effect
 from compensator.service.outcome import sets_zero, sets_zero_at_rest
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP
@@ -120,7 +120,7 @@ class LoopRun:
         wanted = self._core.loop.wanted
         if wanted is not None:
             record = [one for one in self._record if one.sample.time_utc_ns > wanted.from_utc_ns]
-            self._found = self._diagnosed(record)
+            self._found = self._diagnosed(record, wanted.without)
         events = (*notes, *outcome.notes, *followed.notes)
         return LoopStep(outcome, followed.candidates, events, outcome.offset.model_sha256)
 
@@ -221,9 +221,9 @@ class LoopRun:
         self._compensation, self._data, notes = self._core.exchange(self._compensation, self._data, now_ns)
         return notes
 
-    def _diagnosed(self, record: Sequence[Outcome]) -> Diagnosed:
+    def _diagnosed(self, record: Sequence[Outcome], without: str) -> Diagnosed:
         try:
-            return self._diagnose(record, self._calibrated)
+            return without_effect(self._data, without) if without else self._diagnose(record, self._calibrated)
         except CompensatorError as error:
             return failed(str(error))
 

@@ -1,12 +1,17 @@
-"""When a diagnosis begins: at planned times, and while the model errs, each time that this has lasted twice as long."""
+"""When a diagnosis begins: at planned times, and while the model errs, each time that this has lasted twice as long.
+
+A model errs, too, when one of its effects has ended. A diagnosis names that late, as most of its record has the effect:
+so the present model without each of its effects is compared first.
+"""
 
 from __future__ import annotations
 
 from compensator.clock import HOUR_NS, NS
 from compensator.config import Loop as LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.ending import end_diagnosis
-from compensator.service.loop.state import LoopState, Running
+from compensator.service.loop.state import LoopState, Running, same_effects, without
 
 
 def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
@@ -25,23 +30,41 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
     made after `misfit_h`, and the next one when there is twice as much of it on record.
     """
     since_last_min = (now_ns - state.diagnosed_utc_ns) / (60 * NS)
+    from_ns = now_ns - round(settings.record_h * HOUR_NS)
     if planned_ns > state.planned_utc_ns:
         why = "planned"
     elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_min >= state.misfit_min / 2.0:
         why = "misfit"
+        without = _may_have_ended(state, now_ns)
+        if without:
+            state.left_out = [*state.left_out, without]
+            state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why, without=without)
+            return []
     else:
         return []
-    state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
-    from_ns = now_ns - round(settings.record_h * HOUR_NS)
+    state.planned_utc_ns, state.diagnosed_utc_ns, state.left_out = planned_ns, now_ns, []
     state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
     return [_begins(state.diagnosis)]
+
+
+def _may_have_ended(state: LoopState, now_ns: int) -> str:
+    """Return an effect without which the present model is to be compared; empty if there is none.
+
+    A model with one effect is, without it, the calibrated one, which a diagnosis that finds nothing leads to.
+    """
+    for effect in dict.fromkeys(state.effects):
+        others = without(state.effects, effect)
+        is_compared = any(same_effects(place.effects, others) for place in state.taken)
+        if others and effect not in state.left_out and not is_compared and not is_avoided(state, others, now_ns):
+            return effect
+    return ""
 
 
 def begin_again(state: LoopState) -> list[Note]:
     """Begin a diagnosis once more that the end of the service has interrupted."""
     running, notes = state.diagnosis, end_diagnosis(state, "interrupted")
-    if running is None:
-        return []
+    if running is None or running.without:
+        return notes
     if running.attempts > 1:
         data = LoopData(step=LoopAction.END, why="interrupted")
         text = "a diagnosis was interrupted twice: the next one is made when it is planned"

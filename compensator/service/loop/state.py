@@ -16,7 +16,7 @@ from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 3
+STATE_SCHEMA = 4
 
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
@@ -29,10 +29,16 @@ def same_effects(a: Sequence[str], b: Sequence[str]) -> bool:
     return sorted(a) == sorted(b)
 
 
+def without(effects: Sequence[str], effect: str) -> list[str]:
+    """Return effects without one of them."""
+    return [one for one in effects if one != effect]
+
+
 class Running(msgspec.Struct, frozen=True, kw_only=True):
     """A diagnosis: what is diagnosed, why, how often it was begun, and whether its candidate is being warmed up.
 
-    `found` is its result then. `is_next`: the candidate gets its place before the next sample.
+    `found` is its result then. `is_next`: the candidate gets its place before the next sample. `without`: nothing is
+    diagnosed, the candidate is the present model without this effect.
     """
 
     from_utc_ns: int
@@ -42,6 +48,7 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     candidate_sha256: str = ""
     found: DiagnosisData | None = None
     is_next: bool = False
+    without: str = ""
 
 
 class Place(msgspec.Struct, kw_only=True):
@@ -120,6 +127,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
         A diagnosis that was begun.
+    left_out : list of str
+        Effects of the present model without which it was to be compared since the last diagnosis.
     planned_utc_ns, diagnosed_utc_ns : int
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min : float
@@ -135,7 +144,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     uncompared_ns : int
         Since when, ns since 1970 UTC.
     found : list of Place
-        What diagnoses have found: candidates, and the calibrated model.
+        What diagnoses have found: candidates, and the calibrated model; and the present one without an effect.
     watched : Place, optional
         The model before the last adoption.
     adopted_utc_ns : int
@@ -158,6 +167,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     incoming: str = ""
     level_um: float = 0.0
     diagnosis: Running | None = None
+    left_out: list[str] = []
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0

@@ -7,6 +7,7 @@ itself.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,11 +20,13 @@ from compensator.errors import CompensatorError, ModelError
 from compensator.events import DiagnosisData
 from compensator.model.effects import Effect
 from compensator.model.effects.regression import Regression
+from compensator.model.model_file import parse_model
+from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, model_of
 
-#: Verdict of a diagnosis that ended without a result.
-FAILED = "failed"
+#: Verdict of a diagnosis that ended without a result, and of what is none: the present model without an effect.
+FAILED, WITHOUT = "failed", "without"
 _EXPLAINING = ("explained", "partly_explained")
 
 
@@ -45,6 +48,8 @@ class Diagnosed:
         What a person has to do.
     y_moved_utc_ns : int
         When measured Y last moved by itself, ns since 1970 UTC; 0 if it has not.
+    without : str
+        The effect that the model, the present one otherwise, does not have; empty for what a diagnosis found.
     """
 
     verdict: str
@@ -53,11 +58,29 @@ class Diagnosed:
     text: str
     needs: str = ""
     y_moved_utc_ns: int = 0
+    without: str = ""
 
 
 def failed(why: str) -> Diagnosed:
     """Return a diagnosis that gave nothing."""
     return Diagnosed(FAILED, (), None, f"the diagnosis failed: {why}", why)
+
+
+def without_effect(present: bytes, effect: str) -> Diagnosed:
+    """Return the present model without an effect, which may have ended, in the place of a diagnosis.
+
+    Raises
+    ------
+    CompensatorError
+        If it does not have this effect, or its file cannot be used.
+    """
+    model = parse_model(present, source="present model")
+    kept = tuple(one for one in model.effects if name_of(one) != effect)
+    if len(kept) == len(model.effects):
+        raise ModelError(f"present model: no effect {effect}")
+    less = dataclasses.replace(model, effects=kept)
+    text = f"measured and predicted Y have diverged: has {effect} ended?"
+    return Diagnosed(WITHOUT, tuple(effect_names(less)), dump_model(less).encode(), text, without=effect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +114,7 @@ def weigh(
         Hashes of the models in shadow.
     """
     base = model_of(config, calibrated, source="calibrated model")
-    explains = found.verdict in _EXPLAINING and bool(found.effects)
+    explains = bool(found.without) or (found.verdict in _EXPLAINING and bool(found.effects))
     data = found.model if explains else None
     if not explains and found.verdict != FAILED and present.sha256 != base.sha256:
         data = calibrated
@@ -126,6 +149,7 @@ def without_candidate(found: Diagnosed) -> DiagnosisData:
         effects=list(found.effects),
         needs=found.needs,
         y_moved_utc_ns=found.y_moved_utc_ns,
+        without=found.without,
     )
 
 

@@ -25,6 +25,8 @@ def begins(found: DiagnosisData) -> Note:
         if found.verdict != "adequate":
             found_again = f"the effects of the present model are not found again ({found.verdict})"
         text = f"{found_again}: the calibrated model is compared with the present one"
+    if found.without:
+        text = f"the present model is compared with itself without {found.without}, which may have ended"
     data = LoopData(
         step=LoopAction.SHADOW,
         role=role_of(found),
