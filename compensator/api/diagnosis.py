@@ -125,6 +125,8 @@ class DiagnosisResult(_DiagnosisFiles):
         Errors of both models in free run as the service runs, on each of the data.
     words : AxisWords
         Names of columns and texts of the axis.
+    since_utc_s : float, optional
+        When the first of the data begin, s since 1970 UTC, where it is known.
     """
 
     model: ThermalModel
@@ -132,6 +134,7 @@ class DiagnosisResult(_DiagnosisFiles):
     remarks: tuple[Remark, ...] = ()
     free_run: tuple[FreeRunErrors, ...] = ()
     words: AxisWords = field(default_factory=AxisWords)
+    since_utc_s: float | None = None
 
     @property
     def verdict(self) -> str:
@@ -170,7 +173,8 @@ class DiagnosisResult(_DiagnosisFiles):
         """Return the content of the page."""
         from compensator.report.diagnosis import page_of
 
-        return self.words(page_of(self.diagnosis, self.model, self.remarks, self.free_run))
+        page = page_of(self.diagnosis, self.model, self.remarks, self.free_run, since_utc_s=self.since_utc_s)
+        return self.words(page)
 
     def plot(self) -> Plot:
         """Plot the residual before and after on held-out data, one run after another."""
@@ -431,7 +435,14 @@ def _diagnosed(
             remarks.append(Remark(DataRemark.NOT_VALIDATED, text))
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
     shown = tuple(one for one in free_run if one.samples)
-    return DiagnosisResult(model=extended, diagnosis=found, remarks=tuple(remarks), free_run=shown, words=words)
+    return DiagnosisResult(
+        model=extended,
+        diagnosis=found,
+        remarks=tuple(remarks),
+        free_run=shown,
+        words=words,
+        since_utc_s=measured[0].since_utc_s,
+    )
 
 
 def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:

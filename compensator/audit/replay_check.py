@@ -137,6 +137,7 @@ class ReplayCheck:
         for note in (*outcome.notes, *followed.notes):
             if not any(is_recorded(note, event) for event in step.events):
                 self._count(self._difference("event", sample, (_missing_note(note, step.events),)))
+        result.decisions += sum(note.kind == EventKind.LOOP for note in followed.notes)
         for event in decisions_in(step) if self._loop is not None else ():
             if not any(is_recorded(note, event) for note in followed.notes):
                 self._count(

@@ -63,6 +63,8 @@ class RecordingAudit:
         Whether the service started with this file.
     differing, difference : int, Difference or None
         Samples that the replay does not reproduce, and the first of them.
+    decisions : int
+        Decisions of the loop that were made again in the replay, and compared.
     early_seqs : set of int
         Samples whose offset was published before it was on disk.
     removed : list of str
@@ -110,6 +112,7 @@ class RecordingAudit:
     restarted: bool = False
     differing: int = 0
     difference: Difference | None = None
+    decisions: int = 0
     early_seqs: set[int] = field(default_factory=set)
     removed: list[str] = field(default_factory=list)
     not_replayed: str = ""

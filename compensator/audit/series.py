@@ -55,6 +55,11 @@ class Audit:
         return sum(file.samples for file in self.files)
 
     @property
+    def decisions(self) -> int:
+        """Number of decisions of the loop that were made again."""
+        return sum(file.decisions for file in self.files)
+
+    @property
     def differing(self) -> int:
         """Number of samples that the replay does not reproduce."""
         return sum(file.differing for file in self.files)
@@ -442,7 +447,8 @@ def summary(found: Audit) -> str:
     elif not found.differing:
         every = "of the samples that it could replay" if not found.clean or partly(found) else ""
         words = ["The replay reproduces every estimate and every offset", every]
-        lines.append(f"{' '.join(filter(None, words))}, bit for bit.")
+        decided = f" It makes the {found.decisions} decisions of the loop again, on the same figures."
+        lines.append(f"{' '.join(filter(None, words))}, bit for bit.{decided if found.decisions else ''}")
     else:
         lines.append(f"{found.differing} sample(s) differ in the replay. The first of them:")
         lines += found.difference.lines() if found.difference else []

@@ -40,14 +40,21 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def _folders(given: Sequence[Path]) -> list[Path]:
-    """Return the folder of each machine: those given, or, where one has no recordings itself, those in it."""
+    """Return the folder of each machine: those given, or, where one has no recordings itself, those in it that have."""
     found = []
     for folder in given:
         if not folder.is_dir():
             raise DataError(f"{folder}: no folder, expected one with the recordings of a machine")
-        below = [one for one in sorted(folder.iterdir()) if one.is_dir() and any(one.glob("*.mcap"))]
-        found += [folder] if any(folder.glob("*.mcap")) or not below else below
+        found += _with_recordings(folder) or [folder]
     return list(dict.fromkeys(found))
+
+
+def _with_recordings(folder: Path) -> list[Path]:
+    """Return a folder if it has recordings, or else those in it that have."""
+    if any(folder.glob("*.mcap")):
+        return [folder]
+    below = sorted(one for one in folder.iterdir() if one.is_dir() and not one.is_symlink())
+    return [found for one in below for found in _with_recordings(one)]
 
 
 def _each(folders: Sequence[Path], policy: Policy, progress: Progress, executor: Executor | None) -> list[MachineLoop]:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Sample period of identified models, s, as in the service.
 PERIOD_S = 60.0
+#: A time before 2001 counts from the start of a record, s since 1970 UTC.
+EARLIEST_UTC_S = 978_307_200.0
 _NEEDED = ("t_q_degc", "at_degc", "y_um")
 
 
@@ -97,6 +99,12 @@ class Measurement(display.Shown):
     def name(self) -> str:
         """Name in messages."""
         return self.table.name
+
+    @property
+    def since_utc_s(self) -> float | None:
+        """Time of the first row, s since 1970 UTC; None where it is not known."""
+        first_s = float(self.table.t_s.min()) + (self.table.start_utc_s or 0.0)
+        return None if self.local_time or first_s < EARLIEST_UTC_S else first_s
 
     @property
     def hours(self) -> float:

@@ -68,7 +68,12 @@ def tone_of(found: Mapping[str, Any]) -> Tone:
 
 
 def page_of(
-    diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], free_run: Sequence[FreeRunErrors] = ()
+    diagnosis: Diagnosis,
+    model: ThermalModel,
+    remarks: Sequence[str],
+    free_run: Sequence[FreeRunErrors] = (),
+    *,
+    since_utc_s: float | None = None,
 ) -> Page:
     """Make the page.
 
@@ -82,8 +87,10 @@ def page_of(
         Remarks on the data.
     free_run : sequence of FreeRunErrors
         Errors of both models in free run as the service runs.
+    since_utc_s : float, optional
+        When the data begin, s since 1970 UTC.
     """
-    time = TimeAxis.of(diagnosis)
+    time = TimeAxis.of(diagnosis, since_utc_s)
     found = figures(diagnosis, free_run)
     blocks: list[Block] = [_picture(time, diagnosis)] if diagnosis.effects else []
     if len(diagnosis.effects) + (diagnosis.remainder is not None) != 1:
@@ -115,7 +122,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     below = tuple(
         Figure(
             title="",
-            x_label="time, h",
+            x_label=time.label,
             y_label=unit,
             lines=(time.line(label, values),),
             edges=time.unnamed_runs,
@@ -143,7 +150,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         lines.append(time.line("remainder (explains nothing)", diagnosis.remainder_um))
     return Figure(
         title=f"Measured − predicted by the base model, and {words}",
-        x_label="time, h",
+        x_label=time.label,
         y_label="Y, µm",
         lines=tuple(lines),
         edges=time.runs,
@@ -165,7 +172,7 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         lines.append(time.line(f"after: {' and '.join(parts)}", diagnosis.held_out_after))
     return Figure(
         title=f"Residual{' before and after the extension' if parts else ''} on held-out data",
-        x_label="time, h",
+        x_label=time.label,
         y_label="residual, µm",
         lines=tuple(lines),
         edges=time.edges,
@@ -193,7 +200,12 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
     causes = _causes(diagnosis, effect)
     below = tuple(
         Figure(
-            title="", x_label="time, h", y_label=unit, lines=(time.line(label, values),), edges=time.unnamed, height=1.9
+            title="",
+            x_label=time.label,
+            y_label=unit,
+            lines=(time.line(label, values),),
+            edges=time.unnamed,
+            height=1.9,
         )
         for label, unit, values in causes
     )
@@ -201,7 +213,7 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
     note = f"Residual in the data that were searched, without every other effect.{rest}"
     return Figure(
         title=f"{name(effect)} in the residual",
-        x_label="time, h",
+        x_label=time.label,
         y_label="Y, µm",
         lines=(
             time.line(
@@ -253,7 +265,7 @@ def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks:
     ]
     figure = Figure(
         title="Residual of the fit to all data",
-        x_label="time, h",
+        x_label=time.label,
         y_label="residual, µm",
         lines=(time.line("before", diagnosis.residual_before), time.line("after", diagnosis.residual_after)),
         edges=time.runs,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Self
 
 import numpy as np
@@ -99,16 +100,19 @@ class TimeAxis:
         Number of the run.
     blocks, runs : tuple of Edges
         Edges of held-out blocks, and starts of runs after the first; empty where there are none.
+    label : str
+        Label of the axis.
     """
 
     hours: Vector
     run: Indices
     blocks: tuple[Edges, ...]
     runs: tuple[Edges, ...]
+    label: str = "time, h"
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis) -> Self:
-        """Return the time axis of a diagnosis."""
+    def of(cls, diagnosis: Diagnosis, since_utc_s: float | None = None) -> Self:
+        """Return the time axis of a diagnosis, of data that begin at a time where it is known, s since 1970 UTC."""
         sizes = [record.size for record in diagnosis.evidence.signals]
         run = np.repeat(np.arange(len(sizes)), sizes)
         hours = np.arange(run.size) * (diagnosis.model.period_s / 3600.0)
@@ -124,7 +128,12 @@ class TimeAxis:
         if diagnosis.could_hide is not None and not diagnosis.evidence.holds_out_recordings:
             # Every so many values are held out: there are no blocks of time.
             changes = changes[:0]
+        label = "time, h"
+        if since_utc_s is not None and not starts.size:
+            first_s = since_utc_s + float(diagnosis.evidence.runs[0].t_s[0])
+            label += f" after {datetime.fromtimestamp(first_s, UTC):%Y-%m-%d %H:%M} UTC"
         return cls(
+            label=label,
             hours=np.asarray(hours),
             run=run,
             blocks=_edges(f"edge between the {len(masks)} held-out blocks", hours[changes]),

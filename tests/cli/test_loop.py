@@ -137,9 +137,10 @@ def test_a_shop_is_a_folder_of_folders_and_one_bad_machine_stops_no_other(
     tmp_path: Path, told: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("compensator.commands.workers.os.cpu_count", lambda: 1)
-    bad = tmp_path / "rubbish"
-    bad.mkdir()
+    bad = tmp_path / "hall" / "rubbish" / "recordings"
+    bad.mkdir(parents=True)
     (bad / "torn.mcap").write_bytes(b"no recording")
+    (tmp_path / "hall" / "round").symlink_to(tmp_path)
     page = tmp_path / "shop.html"
     assert main(["loop", str(tmp_path), "--page", str(page)]) == 0
     text = capsys.readouterr().out

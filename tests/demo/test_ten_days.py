@@ -125,8 +125,8 @@ def test_a_machine_runs_with_its_sensor_or_its_probes(short, is_probed):
 
     outcomes, events = demo._looped(LoopRun(config, read_model_bytes("quill"), diagnose), samples)
     assert len(outcomes) == 1440
-    # 20 h after the start at 06:00 it is 02:00; with probes also 12 h before, and after the effects have shown for 3 h.
-    assert asked == ([480, 1200, 1320] if is_probed else [1200])
+    # 20 h after the start at 06:00 it is 02:00; with probes also 12 h before. And after the effects have shown for 3 h.
+    assert asked == ([480, 1200, 1320] if is_probed else [859, 1039, 1200])
     assert {event.kind for event in events} == {"loop", "diagnosis"}
     probes = [probe for outcome in outcomes for probe in outcome.probes]
     assert len(probes) == (23 if is_probed else 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.data.measurement import read
 from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
@@ -296,6 +298,28 @@ def axis(*records: dict[str, np.ndarray]) -> TimeAxis:
     runs = [run for columns in records for run in runs_from(columns)]
     evidence = evidence_of(QUILL, runs)
     return TimeAxis.of(SimpleNamespace(evidence=evidence, model=QUILL, could_hide=None))  # type: ignore[arg-type]
+
+
+def drawn_in(blocks: Any) -> list[Figure]:
+    """Return all figures of a page."""
+    own = [block for block in blocks if isinstance(block, Figure) and not block.bars]
+    return own + [figure for block in blocks if hasattr(block, "blocks") for figure in drawn_in(block.blocks)]
+
+
+def test_the_time_of_one_run_has_its_date(found: Diagnosis) -> None:
+    since_s = datetime(2026, 11, 28, 2, 0, tzinfo=UTC).timestamp()
+    figures = drawn_in(page_of(found, found.model, (), since_utc_s=since_s).blocks)
+    assert {one.x_label for one in figures} == {"time, h after 2026-11-28 02:00 UTC"} and len(figures) > 3
+    assert TimeAxis.of(found).label == "time, h"
+
+
+@pytest.mark.parametrize(
+    ("times", "since_s"),
+    [({"time_utc": ["2026-11-28T02:00:00Z", "2026-11-28T02:01:00Z"]}, 1795831200.0), ({"t_s": [60.0, 120.0]}, None)],
+)
+def test_when_data_begin_is_known_of_times_with_a_date_alone(times: Any, since_s: float | None) -> None:
+    columns = {name: [20.0, 20.1] for name in ("t_q_degc", "at_degc", "y_um")}
+    assert read(times | columns).since_utc_s == since_s
 
 
 def test_edges_of_blocks_and_runs_are_marked_and_no_curve_crosses_from_run_to_run() -> None:

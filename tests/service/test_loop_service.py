@@ -17,7 +17,7 @@ import pytest
 
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.audit.series import audit
+from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.messages import Candidate, Event
@@ -128,6 +128,8 @@ async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is
     await machine.run(60)
     steps = machine.steps()
     assert steps == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
+    audited = summary(audit(recordings(machine.recordings, MACHINE)))
+    assert "bit for bit. It makes the 3 decisions of the loop again, on the same figures.\n" in audited
     assert machine.store.in_use() == extended() and machine.store.calibrated() == QUILL
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     checked(machine)

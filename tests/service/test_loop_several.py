@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -154,9 +154,10 @@ class Stands:
         )
 
 
-def chosen(*stand: Stands) -> list[tuple[str, str]]:
+def chosen(*stand: Stands, present: Sequence[str] = (), policy: Any = "adopt") -> list[tuple[str, str]]:
     """Return what a loop decides about candidates after new verdicts; each pair is compared at most once."""
-    loop = full(*(one.one for one in stand))
+    loop = full(*(one.one for one in stand), policy=policy)
+    loop.state.effects = list(present)
     loop.state.diagnosis = None
     loop.compared = lambda one: next(found for found in stand if found.one is one)  # type: ignore
     notes = loop._choose([one.one for one in stand], NOW_NS)
@@ -179,6 +180,14 @@ def test_a_pair_of_candidates_is_compared_once() -> None:
     proposed.is_proposed = True
     stand = Stands(proposed, "", None), Stands(place("b", 8.0), "ac", None), Stands(place("c", 6.0), "a", None)
     assert chosen(*stand) == [("withdraw", "a"), ("propose", "b")]
+
+
+def test_nobody_is_asked_for_a_zero_because_of_newer_parameters_of_the_present_effects() -> None:
+    newer = place("a", 5.0)
+    assert chosen(Stands(newer, "", None), present=newer.effects) == []
+    assert chosen(Stands(newer, "", 0.0), present=newer.effects) == [("adopt", "a")]
+    # A person who decides about each model decides about these, too.
+    assert chosen(Stands(newer, "", None), present=newer.effects, policy="propose") == [("propose", "a")]
 
 
 @pytest.mark.parametrize("policy", ["propose", "adopt"])

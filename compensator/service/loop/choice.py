@@ -17,7 +17,7 @@ from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.place import is_asked, leads
 from compensator.service.loop.proof import is_clearly_better
-from compensator.service.loop.state import LoopState, Place
+from compensator.service.loop.state import LoopState, Place, same_effects
 
 
 class Choice:
@@ -68,11 +68,16 @@ class Choice:
         return None
 
     def proposed(self, better: Sequence[Place]) -> Place | None:
-        """Return the one that a person is asked about, in the place of a proposed one that it surpasses."""
+        """Return the one that a person is asked about, in the place of a proposed one that it surpasses.
+
+        Under `adopt` nobody is asked for a zero because of newer parameters: they are adopted once they are better
+        about the zero there is.
+        """
         before, by_hand = self._state.proposed, self._settings.policy == "propose"
         for place in better:
             is_next = before is None or (place is not before and self._surpasses(place, before))
-            if not is_next or any(self._surpassing(place)):
+            is_known = not by_hand and same_effects(place.effects, self._state.effects)
+            if is_known or not is_next or any(self._surpassing(place)):
                 continue
             if by_hand or self._compared(place).level_um is None:
                 return place
