@@ -12,13 +12,15 @@ from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ModelError
 from compensator.events import DiagnosisData
+from compensator.model.model_file import parse_model
 from compensator.recording.reading import messages, recordings
 from compensator.service.loop.avoided import avoid
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.schedule import begin_if_due
 from compensator.service.loop.state import LoopState, Place
-from compensator.service.loop.weighing import without_effect
+from compensator.service.loop.weighing import weigh, without_effect
+from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
 from tests.service.looping import (
     DAY,
@@ -74,7 +76,8 @@ def _jumps(steps: list[LoopStep]) -> float:
 
 def misfit(*places: Place, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
     """The state of a loop whose model has erred for four hours."""
-    return LoopState(effects=effects, found=list(places), misfit_min=240.0, planned_utc_ns=NOW_NS, **changes)
+    last = {"planned_utc_ns": NOW_NS, "adopted_utc_ns": NOW_NS - 24 * HOUR_NS}
+    return LoopState(effects=effects, found=list(places), misfit_min=240.0, **(last | changes))
 
 
 def begun(state: LoopState) -> tuple[str, str]:
@@ -107,9 +110,30 @@ def test_what_runs_already_or_is_avoided_is_not_begun() -> None:
     assert begun(state) == ("misfit", "")
 
 
-@pytest.mark.parametrize("effects", [[], ["gain:DTF"]])
-def test_a_model_with_one_effect_is_without_it_the_calibrated_one(effects: list[str]) -> None:
-    assert begun(misfit(effects=effects)) == ("misfit", "")
+def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
+    assert begun(misfit(adopted_utc_ns=0)) == ("misfit", "")
+    assert begun(misfit(effects=[])) == ("misfit", "")
+    # It was adopted by the loop, and then a person has calibrated the machine with these effects.
+    state = misfit()
+    begin_if_due(state, LoopSettings(), NOW_NS, NOW_NS)
+    loop = Loop(LoopSettings(), 60.0, EFFECTS, state)
+    present = parse_model(BOTH, source="test")
+    found = without_effect(BOTH, EFFECTS[0])
+    weighed = weigh(found, settings(), calibrated=BOTH, present=present, in_shadow=[])
+    assert weighed.candidate is None and weighed.data.refused
+    assert loop.receive(weighed.data, NOW_NS) == [] and loop.wanted is None
+
+
+def test_the_last_effect_ends_long_after_the_model_before_it_was_compared() -> None:
+    """The diagnoses name it all the time: most of their records have it."""
+    ends = 3 * DAY
+    tables = {"loop": NIGHTLY | {"watch_h": 24.0}} | CHECKED
+    loop = LoopRun(settings(**tables), QUILL_FILE, Night(shown(extended())))
+    steps = run(loop, machine(4 * DAY, lambda i: float(i < ends)))
+    found = decisions(steps)
+    (back,) = [seq for seq, step, _ in found if step == "back"]
+    assert ("end", "watched") in [one[1:] for one in found if one[0] < ends] and ends < back < ends + DAY // 2
+    assert steps[-1].model_sha256 == sha256_of(QUILL_FILE)
 
 
 def test_at_a_planned_time_nothing_is_left_out() -> None:

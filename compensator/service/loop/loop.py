@@ -258,6 +258,8 @@ class Loop:
         state.diagnosis = None
         self._judge_y(found, running)
         why = why_nothing(state, self._settings, found, now_ns)
+        if why == "refused" and found.without:
+            return []  # an effect of the calibrated model, about which a person decides
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
         return [nothing_follows(why, found)] if why else []

@@ -50,12 +50,12 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
 def _may_have_ended(state: LoopState, now_ns: int) -> str:
     """Return an effect without which the present model is to be compared; empty if there is none.
 
-    A model with one effect is, without it, the calibrated one, which a diagnosis that finds nothing leads to.
+    Before the loop has adopted a model all effects are those of the calibrated one, which a person decides about.
     """
-    for effect in dict.fromkeys(state.effects):
+    for effect in dict.fromkeys(state.effects if state.adopted_utc_ns else ()):
         others = without(state.effects, effect)
         is_compared = any(same_effects(place.effects, others) for place in state.taken)
-        if others and effect not in state.left_out and not is_compared and not is_avoided(state, others, now_ns):
+        if effect not in state.left_out and not is_compared and not is_avoided(state, others, now_ns):
             return effect
     return ""
 

@@ -79,7 +79,7 @@ def without_effect(present: bytes, effect: str) -> Diagnosed:
     if len(kept) == len(model.effects):
         raise ModelError(f"present model: no effect {effect}")
     less = dataclasses.replace(model, effects=kept)
-    text = f"measured and predicted Y have diverged: has {effect} ended?"
+    text = f"measured and predicted Y have diverged: the model without {effect}, which may have ended"
     return Diagnosed(WITHOUT, tuple(effect_names(less)), dump_model(less).encode(), text, without=effect)
 
 
@@ -117,6 +117,8 @@ def weigh(
     explains = bool(found.without) or (found.verdict in _EXPLAINING and bool(found.effects))
     data = found.model if explains else None
     if not explains and found.verdict != FAILED and present.sha256 != base.sha256:
+        data = calibrated
+    if data is not None and found.without and not found.effects:
         data = calibrated
     plain = without_candidate(found)
     if data is None:
