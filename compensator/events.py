@@ -273,6 +273,8 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     without : str
         The effect that the candidate, the present model otherwise, does not have: it may have ended. Nothing was
         diagnosed then.
+    fewer : bool
+        Whether it is a way back: the present model has its effects and more, and no person decides about it.
     same_effects : bool
         Whether the present model has the same effects.
     change_deviations : float, optional
@@ -298,6 +300,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     candidate: str = ""
     calibrated: bool = False
     without: str = ""
+    fewer: bool = False
     same_effects: bool = False
     change_deviations: float | None = None
     in_shadow: bool = False

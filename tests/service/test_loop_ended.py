@@ -69,6 +69,29 @@ def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() 
     assert _jumps(steps) <= 8.0 + 1e-9
 
 
+@pytest.mark.parametrize(("policy", "step"), [("adopt", "back"), ("propose", "propose")])
+def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person_decides(
+    policy: str, step: str
+) -> None:
+    """It does not know its level: measured Y was shifted before. The present level stays."""
+    assert QUILL.dtf is not None
+    y_um = QUILL.dtf.sampled.response(heat_w(4 * DAY))
+    ends, night = 2 * DAY, Night(shown(BOTH))
+    loop = LoopRun(settings(loop=NIGHTLY | {"policy": policy, "every_h": 12}), QUILL_FILE, night)
+    source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: 0.2 * float(y_um[i]) + 8.0 * (i > 300))
+    steps = run(loop, source, 1)
+    while len(loop.effects) < 2:
+        steps += run(loop, source, 1)
+        if loop.phase == "proposed":
+            loop.accept()
+    steps += run(loop, source, ends - len(steps))
+    night.found = [shown(stronger(0.19))]
+    steps = run(loop, source)
+    assert {one for _, one, _ in decisions(steps)} & {"adopt", "back", "propose"} == {step}
+    if step == "back":
+        assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 2 :])) < 1.0
+
+
 def _jumps(steps: list[LoopStep]) -> float:
     offsets = np.array([step.outcome.offset.y_offset_um for step in steps[1:]])
     return float(np.max(np.abs(np.diff(offsets))))
@@ -155,7 +178,7 @@ def test_it_is_a_way_back_and_ways_back_share_what_they_must_show() -> None:
     begin_if_due(state, LoopSettings(), NOW_NS, NOW_NS)
     loop = Loop(LoopSettings(policy="propose"), 60.0, EFFECTS, state)
     less = DiagnosisData(
-        verdict="without", effects=["gain:DTF"], candidate_sha256="b" * 64, without="input:coolant_degc"
+        verdict="without", effects=["gain:DTF"], candidate_sha256="b" * 64, without="input:coolant_degc", fewer=True
     )
     assert loop.receive(less, NOW_NS) == []
     (note,) = loop.begin()

@@ -15,6 +15,7 @@ from compensator.service.loop.proof import (
     BETTER_PART,
     LEVEL_PART,
     is_better_about_zero,
+    is_better_to_go_back_to,
     is_clearly_better,
     is_enough,
     shared,
@@ -119,7 +120,16 @@ class Compared:
         found = is_clearly_better(place.verdict) and is_enough(
             place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
         )
-        return found and (not place.comparison.model_ns or self._comparison.is_itself_better())
+        return found and self._is_itself_better
+
+    @property
+    def is_better_to_go_back_to(self) -> bool:
+        """Whether a way back is better, and in its own hours, too."""
+        return is_better_to_go_back_to(self._place.verdict) and self._is_itself_better
+
+    @property
+    def _is_itself_better(self) -> bool:
+        return not self._place.comparison.model_ns or self._comparison.is_itself_better()
 
     @property
     def is_worse(self) -> bool:

@@ -34,7 +34,6 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.proof import is_better_to_go_back_to
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import LoopState, Place, Running, same_effects
@@ -197,7 +196,7 @@ class Loop:
         if self.state.clean_min < CLEAN_MIN or not is_judged:
             return []
         if not is_candidate:
-            return self._go_back(place) if is_better_to_go_back_to(place.verdict) else []
+            return self._go_back(place) if self.compared(place).is_better_to_go_back_to else []
         if self.compared(place).is_worse:
             return end(self.state, place, "worse")
         if place.is_proposed and falls(place.verdict, self._settings):

@@ -38,8 +38,8 @@ def remembered_h(settings: LoopSettings, role: Role) -> float:
 
 
 def role_of(found: DiagnosisData) -> Role:
-    """Return the role of a candidate: to the calibrated model, or without an effect, the service goes back."""
-    return "before" if found.calibrated or found.without else "candidate"
+    """Return the role of a candidate: to the calibrated model, or to fewer effects, the service goes back."""
+    return "before" if found.calibrated or found.fewer else "candidate"
 
 
 def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, now_ns: int) -> str:
@@ -65,9 +65,9 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
 
 
 def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place | None:
-    """Return the candidate with the effects of another one, which then goes on with its comparison."""
-    alike = [place for place in state.candidates if same_effects(place.effects, effects)]
-    return alike[0] if alike and role == "candidate" and not state.exchange else None
+    """Return what was found with the effects and the role of another model, which then goes on with its comparison."""
+    alike = [place for place in state.found if place.role == role and same_effects(place.effects, effects)]
+    return alike[0] if alike and not state.exchange else None
 
 
 def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | None:

@@ -136,12 +136,22 @@ def weigh(
         effects=effects,
         candidate_sha256=model.sha256,
         candidate=model.name,
+        fewer=_is_way_back(effects, effect_names(present), found, config),
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
         in_shadow=model.sha256 in in_shadow,
         calibrated=model.sha256 == base.sha256,
     )
     return Weighed(weighed, data)
+
+
+def _is_way_back(effects: Sequence[str], present: Sequence[str], found: Diagnosed, config: Config) -> bool:
+    """Return whether the service goes back to a model by itself, which the present one has all effects of and more.
+
+    Where a person decides only if it is the present model otherwise: that one has been agreed to.
+    """
+    by_hand = config.loop is None or config.loop.policy == "propose"
+    return set(effects) < set(present) and bool(found.without or not by_hand)
 
 
 def without_candidate(found: Diagnosed) -> DiagnosisData:
