@@ -263,7 +263,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     Parameters
     ----------
     verdict : str
-        As in `diagnosis.json`; `failed` if there is none.
+        As in `diagnosis.json`; `failed` if there is none; empty where nothing was diagnosed (`without`).
     effects : list of str
         Effects of the candidate, each with its kind and place.
     candidate_sha256, candidate : str
@@ -271,16 +271,15 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     calibrated : bool
         Whether the candidate is the calibrated model itself.
     without : str
-        The effect that the candidate, the present model otherwise, does not have: it may have ended. Nothing was
-        diagnosed then.
+        The effect that the candidate, the present model otherwise, does not have: it may have ended.
     fewer : bool
         Whether it is a way back: the present model has its effects and more, and no person decides about it.
+    present_sha256 : str
+        Hash of the present model that it was weighed beside; empty where there is no candidate.
     same_effects : bool
         Whether the present model has the same effects.
     change_deviations : float, optional
         If so, by how many standard deviations the parameter that differs most does.
-    in_shadow : bool
-        Whether the candidate is the model in shadow, or differs from it by less than the deviations say.
     refused : str
         Why the candidate cannot be used.
     needs : str
@@ -301,9 +300,9 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     calibrated: bool = False
     without: str = ""
     fewer: bool = False
+    present_sha256: str = ""
     same_effects: bool = False
     change_deviations: float | None = None
-    in_shadow: bool = False
     refused: str = ""
     needs: str = ""
     y_moved_utc_ns: int = 0

@@ -173,21 +173,26 @@ class _Part:
 
 
 class _Problem:
-    """The least squares problem of some hypotheses; keeps the columns of the last values of each."""
+    """The least squares problem of some hypotheses; keeps the columns of the last values of each.
+
+    Of as many as its slopes need: where one moves by a step, the others are as they were.
+    """
 
     def __init__(self, likelihood: Likelihood, hypotheses: Sequence[Hypothesis]) -> None:
         self.likelihood, self.hypotheses = likelihood, hypotheses
         self.free = [free for hypothesis in hypotheses for free in hypothesis.free]
-        self._known: list[_Part | None] = [None] * len(hypotheses)
+        self._known: list[list[_Part]] = [[] for _ in hypotheses]
 
     def parts(self, x: Vector) -> list[_Part]:
         natural = iter([from_search(free, float(v)) for free, v in zip(self.free, x, strict=True)])
         found = []
         for i, hypothesis in enumerate(self.hypotheses):
             values = tuple(itertools.islice(natural, len(hypothesis.free)))
-            part = self._known[i]
-            if part is None or part.values != values:
-                part = self._known[i] = _part(self.likelihood, hypothesis, values)
+            last = self._known[i]
+            part = next((one for one in last if one.values == values), None)
+            if part is None:
+                part = _part(self.likelihood, hypothesis, values)
+            self._known[i] = [part, *(one for one in last if one is not part)][: 1 + len(hypothesis.free)]
             found.append(part)
         return found
 

@@ -159,12 +159,12 @@ def loop_text(loop: Mapping[str, Any]) -> str:
         "idle": "Model: no other one is compared with it.",
         "shadow": f"Model: a candidate with {effects} runs beside the present one. {why}.",
         "proposed": f"Model: one that has shown itself better is proposed, with {effects}. Now: {loop['text']}.",
-        "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {why}.",
+        "watching": f"Model: the service goes back to one with {effects} where that is better. {why}.",
     }
     text = words[loop["phase"]]
     if loop.get("before_effects") is not None:
         before = ", ".join(loop["before_effects"]) or "no added effect"
-        text += f" The one before the last change ({before}) goes on, too: {loop['before_text']}."
+        text += f" The one before the last change, with {before}, goes on, too: {loop['before_text']}."
     if loop.get("others"):
         text += f" Compared, too: {'. '.join(loop['others'])}."
     return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text

@@ -184,7 +184,7 @@ def test_a_candidate_that_was_never_compared_says_why() -> None:
     (waits,) = loop.state.found
     why = "nothing is compared while a sensor is suspected under both models (implausible:t_q_degc, implausible:y_um)"
     assert described(waits.verdict) == f"no verdict: {why}"
-    assert ended("gives_way", waits.verdict).endswith(f"promises least: no verdict: {why}")
+    assert ended("gives_way", waits.verdict).endswith(f"promises least; no verdict: {why}")
     waited(loop, range(1, 2), never)
     assert "suspected" not in described(waits.verdict) and waits.verdict.samples > 0
 

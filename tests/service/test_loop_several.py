@@ -97,9 +97,8 @@ def found(effects: list[str]) -> DiagnosisData:
     return DiagnosisData(verdict="explained", effects=effects, candidate_sha256="n" * 64)
 
 
-@pytest.mark.parametrize("role", ["candidate", "before"])
-def test_where_all_places_are_taken_what_shows_least_gives_way(role: Any) -> None:
-    loop = full(place("a", 2.0), place("b", -1.5, role=role), place("c", None))
+def test_where_all_places_are_taken_what_shows_least_gives_way() -> None:
+    loop = full(place("a", 2.0), place("b", -1.5), place("c", None))
     assert len(loop.state.found) == CANDIDATES
     assert loop.receive(found(["gain:DTF"]), NOW_NS) == []
     assert about(loop.begin()) == [("end", "gives_way"), ("shadow", "")]
@@ -141,6 +140,10 @@ class Stands:
     def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
         self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
         self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
+        self.level_at_return_um = 0.0
+
+    def is_better_to_go_back_to(self, *, is_new: bool) -> bool:
+        return True
 
     def is_better(self, now_ns: int) -> bool:
         return True
@@ -173,6 +176,14 @@ def test_what_has_more_effects_and_whose_level_is_not_known_keeps_out_none_that_
     # Measured Y speaks against the effect of a: it has none of those of c.
     assert chosen(Stands(part), Stands(other, "a", None)) == [("propose", "c")]
     assert chosen(Stands(part), Stands(whole, "a", None), Stands(other, "a")) == [("adopt", "c")]
+
+
+def test_of_several_ways_back_the_one_is_taken_that_shows_most_and_no_other_surpasses() -> None:
+    before, fewer = place("a", 9.0, role="before"), place("b", 5.0, role="before")
+    assert chosen(Stands(before), Stands(fewer, "a")) == [("back", "b")]
+    assert chosen(Stands(fewer), Stands(before)) == [("back", "a")]
+    # A way back comes before what is new.
+    assert chosen(Stands(place("c", 9.0)), Stands(fewer)) == [("back", "b")]
 
 
 def test_a_pair_of_candidates_is_compared_once() -> None:
@@ -432,9 +443,9 @@ def test_a_proposal_that_is_taken_over_is_withdrawn() -> None:
 
 
 def test_what_is_in_force_again_does_not_run_beside_itself() -> None:
-    # Weighed while it was in shadow; the service has gone back to it since.
+    # Weighed beside another model; the service has gone back since.
     core = ModelLoop(settings(), QUILL, {})
     core.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
-    found = DiagnosisData(verdict="adequate", candidate_sha256=QUILL.sha256, calibrated=True, in_shadow=True)
-    assert about(core.receive(found, NOW_NS)) == [("nothing", "unchanged")]
+    found = DiagnosisData(verdict="adequate", candidate_sha256=QUILL.sha256, calibrated=True, present_sha256="b" * 64)
+    assert about(core.receive(found, NOW_NS)) == [("nothing", "replaced")]
     assert core.state.diagnosis is None

@@ -170,7 +170,9 @@ def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
 
 def test_the_model_that_is_watched_does_not_run_twice() -> None:
     loop, now_ns = watching(judged(NOT_JUDGED))
-    found = DiagnosisData(verdict="explained", effects=["gain:TDTF"], candidate_sha256="a" * 64, in_shadow=True)
+    assert loop.state.watched is not None
+    sha256 = loop.state.watched.sha256
+    found = DiagnosisData(verdict="explained", effects=["gain:TDTF"], candidate_sha256=sha256)
     (note,) = loop.receive(found, now_ns)
     assert (note.data["step"], note.data["why"]) == ("nothing", "in_shadow")
 

@@ -429,7 +429,7 @@ def test_a_proposed_model_is_shown_with_its_figures_and_what_a_person_can_answer
     assert "goes on" not in found["line"]
     beside = LOOP | {"before_effects": ["gain:DTF"], "before_text": "no verdict: no zero was set yet"}
     heard.hear(status=status(7, START_NS + 120 * NS, loop=beside))
-    assert "The one before the last change (gain:DTF) goes on, too: no verdict" in heard.machine["loop"]["line"]
+    assert "The one before the last change, with gain:DTF, goes on, too: no verdict" in heard.machine["loop"]["line"]
     others = LOOP | {"others": ["gain:DTF: no verdict", "delay:DTF: last 8 h: present 6.9 µm rms, this one 7.1"]}
     heard.hear(status=status(8, START_NS + 180 * NS, loop=others))
     assert "Compared, too: gain:DTF: no verdict. delay:DTF: last 8 h" in heard.machine["loop"]["line"]

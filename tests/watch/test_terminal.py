@@ -182,7 +182,7 @@ def test_a_proposal_is_a_line_with_two_commands() -> None:
     watching = LOOP | {"phase": "watching", "diagnosing": True}
     shop.receive("shop/vmc-01/thermal/status", status(4, clock.now_ns, loop=watching))
     text = " ".join(shown(shop, 200).replace("│", "").split())
-    assert "goes on beside the adopted one" in text and "A diagnosis is in progress." in text
+    assert "the service goes back to one with" in text and "A diagnosis is in progress." in text
     assert "adopt --candidate" not in text
 
 

@@ -83,18 +83,31 @@ class Choice:
                 return place
         return None
 
+    def gone_back_to(self, judged: Sequence[Place]) -> Place | None:
+        """Return the model that the service goes back to; while a newcomer waits only the one before may be it."""
+        state = self._state
+        ways = [
+            place
+            for place in judged
+            if place.role == "before"
+            and (place is state.watched or not state.has_next)
+            and self._compared(place).is_better_to_go_back_to(is_new=place is not state.watched)
+        ]
+        best = [one for one in ways if not any(self._surpasses(other, one) for other in ways if other is not one)]
+        return max(best or ways, key=lambda place: place.shows, default=None)
+
     def _may_adopt(self, now_ns: int) -> bool:
         """Return whether the loop may adopt a model now.
 
-        Not before `shadow_h` have passed since the last adoption; and not while the model before it is better so far:
-        it would give its place to the present one.
+        Not before `shadow_h` have passed since the last adoption; and not while a way back is better so far: the model
+        before would give its place to the present one.
         """
         state, since_ns = self._state, now_ns - self._state.adopted_utc_ns
         if self._settings.policy != "adopt":
             return False
         if state.adopted_utc_ns and since_ns < self._settings.shadow_h * HOUR_NS:
             return False
-        return state.watched is None or not leads(state.watched.verdict, self._settings)
+        return not any(leads(place.verdict, self._settings) for place in state.ways_back)
 
     def _surpassing(self, place: Place) -> Iterator[Place]:
         return (one for one in self._state.candidates if one is not place and self._surpasses(one, place))

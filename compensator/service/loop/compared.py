@@ -122,10 +122,20 @@ class Compared:
         )
         return found and self._is_itself_better
 
-    @property
-    def is_better_to_go_back_to(self) -> bool:
-        """Whether a way back is better, and in its own hours, too."""
-        return is_better_to_go_back_to(self._place.verdict) and self._is_itself_better
+    def is_better_to_go_back_to(self, *, is_new: bool) -> bool:
+        """Return whether a way back is better, and in its own hours, too.
+
+        Parameters
+        ----------
+        is_new : bool
+            Whether it was never in force. What it leaves about the zero then counts at the level of its return, unless
+            it is the calibrated model, whose own level is right.
+        """
+        found, residuals_um = self._place.verdict, self._comparison.residuals_um
+        if is_new and self._place.effects and residuals_um:
+            left_um = [other - self.level_at_return_um for _, _, other in residuals_um]
+            found = changed(found, candidate_rms_um=math.hypot(*left_um) / math.sqrt(len(left_um)))
+        return is_better_to_go_back_to(found) and self._is_itself_better
 
     @property
     def _is_itself_better(self) -> bool:

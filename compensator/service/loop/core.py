@@ -18,8 +18,8 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.shadow import Role, Shadow, candidate_message
-from compensator.service.loop.state import LoopState, decode_loop
+from compensator.service.loop.shadow import Shadow, candidate_message
+from compensator.service.loop.state import LoopState, Role, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
 from compensator.service.outcome import sets_zero_at_rest
 from compensator.service.status import Handover, Zero
@@ -145,8 +145,7 @@ class ModelLoop:
 
     def weigh(self, found: Diagnosed, *, calibrated: bytes) -> Weighed:
         """Return what follows from a diagnosis; `receive` decides by it."""
-        in_shadow = [place.sha256 for place in self.state.taken]
-        weighed = weigh(found, self._config, calibrated=calibrated, present=self.present, in_shadow=in_shadow)
+        weighed = weigh(found, self._config, calibrated=calibrated, present=self.present)
         return self._of_its_time(weighed)
 
     def plain(self, found: Diagnosed) -> Weighed:
@@ -162,10 +161,8 @@ class ModelLoop:
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis."""
-        if found.candidate_sha256 == self.present.sha256:
-            # It has come back since the diagnosis was weighed: nothing runs beside itself.
-            found = replace_fields(found, same_effects=True, change_deviations=0.0, in_shadow=False)
-        return self.loop.receive(found, now_ns)
+        is_current = found.present_sha256 in ("", self.present.sha256)
+        return self.loop.receive(found, now_ns, is_current=is_current)
 
     @property
     def is_free(self) -> bool:

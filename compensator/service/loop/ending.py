@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.place import role_of
-from compensator.service.loop.state import LoopState, Place
-from compensator.service.loop.words import does_not_begin, ended
+from compensator.service.loop.state import LoopState, Place, without
+from compensator.service.loop.words import does_not_begin, ended, named
+
+#: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
+FAILED_OUTSIDE = "failed"
 
 
 def note_of(
@@ -42,7 +45,8 @@ def withdraw(
 
 def end(state: LoopState, place: Place, why: str, text: str = "") -> list[Note]:
     """End a shadow, and an exchange with it."""
-    notes = [note_of(state, place, LoopAction.END, text or ended(why, place.verdict), why=why)]
+    text = text or f"the model with {named(place.effects)} is compared no longer: {ended(why, place.verdict)}"
+    notes = [note_of(state, place, LoopAction.END, text, why=why)]
     state.remove(place)
     if state.incoming == place.sha256:
         state.exchange, state.incoming = "", ""
@@ -50,8 +54,13 @@ def end(state: LoopState, place: Place, why: str, text: str = "") -> list[Note]:
 
 
 def end_diagnosis(state: LoopState, why: str, text: str = "") -> list[Note]:
-    """End a diagnosis that is under way, and what it has found; it is said if that was said to begin."""
+    """End a diagnosis that is under way, and what it has found; it is said if that was said to begin.
+
+    What was to be left out is not forgotten, unless it cannot be: it is begun again.
+    """
     running, state.diagnosis = state.diagnosis, None
+    if running is not None and running.without and why != FAILED_OUTSIDE:
+        state.left_out = without(state.left_out, running.without)
     if running is None or running.found is None or not running.is_next:
         return []
     found = running.found

@@ -11,6 +11,8 @@ from compensator.events import Note
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, withdraw
+from compensator.service.loop.place import gives_way, role_beside
+from compensator.service.loop.proof import CANDIDATES
 from compensator.service.loop.state import Exchange, LoopState, Place, same_effects
 
 
@@ -50,8 +52,11 @@ def exchanged(
     state.forget_errors()
     state.remove(incoming)
     running, notes = state.diagnosis, list[Note]()
-    if running is not None and running.candidate_sha256:
+    if running is not None and (running.candidate_sha256 or running.without):
         notes += end_diagnosis(state, "replaced")  # it was weighed beside the model that has gone
+    state.left_out = []
+    for place in state.found:
+        place.role = role_beside(place, incoming.effects, settings)
     for place in state.found:
         compared(place).go_on_beside(incoming, level_um)
     if back:
@@ -63,7 +68,8 @@ def exchanged(
                 notes += end(state, place, "replaced")
             elif is_avoided(state, place.effects, now_ns):
                 notes += end(state, place, "avoided")
-        return notes
+        return notes + _make_room(state, settings, now_ns)
+    notes += _make_room(state, settings, now_ns)
     state.adopted_utc_ns = now_ns
     outgoing = Place(sha256=sha256_before, effects=before, role="before", since_utc_ns=now_ns)
     watched = state.watched
@@ -76,4 +82,12 @@ def exchanged(
     if watched is not None:
         notes += end(state, watched, "replaced")
     state.watched = outgoing
+    return notes
+
+
+def _make_room(state: LoopState, settings: LoopSettings, now_ns: int) -> list[Note]:
+    """End candidates for which there is no place: beside another model more are candidates."""
+    notes = list[Note]()
+    while len(state.candidates) > CANDIDATES and (last := gives_way(state, settings, now_ns)) is not None:
+        notes += end(state, last, "gives_way")
     return notes

@@ -13,9 +13,9 @@ from compensator.errors import CompensatorError
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.state import StartDiagnosis
 from compensator.service.loop.weighing import Weighed, failed, without_effect
 from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
@@ -101,14 +101,17 @@ async def diagnosed(core: ModelLoop, present: bytes, diagnose: Diagnose, store: 
     began_ns = clock.utc_ns()
     try:
         calibrated = await asyncio.to_thread(store.calibrated)
-        found = without_effect(present, wanted.without) if wanted.without else await diagnose(wanted, calibrated)
+        if wanted.without:
+            found = without_effect(present, wanted.without, calibrated=calibrated)
+        else:
+            found = await diagnose(wanted, calibrated)
         weighed = await asyncio.to_thread(core.weigh, found, calibrated=calibrated)
     except CompensatorError as error:
-        found = failed(str(error))
+        found = failed(str(error), without=wanted.without)
         weighed = core.plain(found)
     except Exception as error:
         log.exception("internal error of a diagnosis")
-        found = failed(f"internal error: {type(error).__name__}: {error}")
+        found = failed(f"internal error: {type(error).__name__}: {error}", without=wanted.without)
         weighed = core.plain(found)
     return Found(wanted, weighed.lasting((clock.utc_ns() - began_ns) / NS), found.text)
 

@@ -22,10 +22,10 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop
+from compensator.service.loop.ending import FAILED_OUTSIDE
 from compensator.service.loop.found import Found, diagnosed
 from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose
-from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.status import loop_status
 from compensator.service.loop.storing import Storing
 from compensator.service.loop.weighing import effect_names

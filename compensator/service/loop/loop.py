@@ -10,7 +10,6 @@ and going back are one rule. No clock, socket or file: a replay of the recorded 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import msgspec
 
@@ -35,8 +34,7 @@ from compensator.service.loop.place import (
     with_effects,
 )
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
-from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place, Running, same_effects
+from compensator.service.loop.state import LoopState, Place, Role, Running, StartDiagnosis, same_effects, without
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -53,19 +51,6 @@ from compensator.service.transfer.second_opinion import described
 #: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
 #: and a candidate ends that has been at a limit for so long, min.
 CLEAN_MIN = BLOCK_MIN
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartDiagnosis:
-    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC.
-
-    With `without` it is none: the present model without this effect is wanted.
-    """
-
-    from_utc_ns: int
-    to_utc_ns: int
-    why: str
-    without: str = ""
 
 
 class Loop:
@@ -88,18 +73,14 @@ class Loop:
     ) -> None:
         self._settings = settings
         self._period_s = period_s
-        self.state = state if state is not None else LoopState(effects=list(effects))
+        self.state = state if state is not None else LoopState(base_effects=list(effects))
         self.state.effects = list(effects)
 
     @property
     def wanted(self) -> StartDiagnosis | None:
         """The diagnosis that is under way, to be begun or begun again; None if there is none."""
         running = self.state.diagnosis
-        if running is None or running.candidate_sha256:
-            return None
-        return StartDiagnosis(
-            from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why, without=running.without
-        )
+        return None if running is None or running.candidate_sha256 else running.wanted
 
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
@@ -155,15 +136,17 @@ class Loop:
             # Until what is warmed up has its place, before the next sample, nothing that was found decides.
             if not state.exchange and (place is state.watched or not state.has_next):
                 notes += self._decide(place, now_ns, is_judged=place in judged)
-        if judged and not (state.exchange or state.has_next or state.clean_min < CLEAN_MIN):
+        judged = [place for place in judged if place in state.taken]
+        if judged and not (state.exchange or state.clean_min < CLEAN_MIN):
             notes += self._choose(judged, now_ns)
         return notes + self._schedule(now_ns)
 
     def _forget_wrong(self) -> list[Note]:
         """Let go what was found and compared while a temperature was wrong, and nobody knew."""
         state, notes = self.state, end_diagnosis(self.state, "was_wrong")
-        for place in state.candidates:
-            notes += end(state, place, "was_wrong")
+        for place in state.found:
+            if not same_effects(place.effects, state.base_effects):
+                notes += end(state, place, "was_wrong")
         for place in state.taken:
             place.begin_anew()
         return notes
@@ -186,17 +169,15 @@ class Loop:
     # ------------------------------------------------------------------ decisions about a shadow
 
     def _decide(self, place: Place, now_ns: int, *, is_judged: bool) -> list[Note]:
-        """Decide about one model: whether it ends, a proposal falls, or the service goes back to it."""
-        is_candidate = place.role == "candidate"
-        if is_candidate and place.limited_min >= CLEAN_MIN:
+        """Decide about one model: whether it ends, or a proposal falls; the model before ends by its time only."""
+        was_found = place is not self.state.watched
+        if was_found and place.limited_min >= CLEAN_MIN:
             return end(self.state, place, "limits")
         if now_ns - place.since_utc_ns >= self._settings.watch_h * HOUR_NS:
             unshown = "no_answer" if place.is_proposed else "no_difference"
-            return end(self.state, place, unshown if is_candidate else "watched")
-        if self.state.clean_min < CLEAN_MIN or not is_judged:
+            return end(self.state, place, unshown if was_found else "watched")
+        if not was_found or self.state.clean_min < CLEAN_MIN or not is_judged:
             return []
-        if not is_candidate:
-            return self._go_back(place) if self.compared(place).is_better_to_go_back_to else []
         if self.compared(place).is_worse:
             return end(self.state, place, "worse")
         if place.is_proposed and falls(place.verdict, self._settings):
@@ -204,8 +185,13 @@ class Loop:
         return []
 
     def _choose(self, judged: Sequence[Place], now_ns: int) -> list[Note]:
-        """Adopt or propose a candidate, after new verdicts: nothing else changes what is chosen."""
+        """Go back, adopt or propose, after new verdicts: nothing else changes what is chosen."""
         choice = Choice(self.state, self._settings, self.compared)
+        before = choice.gone_back_to(judged)
+        if before is not None:
+            return self._go_back(before)
+        if self.state.has_next:
+            return []
         better = choice.better(judged, now_ns)
         adopted = choice.adopted(better, now_ns)
         if adopted is not None:
@@ -249,16 +235,19 @@ class Loop:
             return []
         return begin_if_due(state, self._settings, now_ns, planned_ns)
 
-    def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
-        """Decide what follows from a diagnosis; a candidate is then warmed up, and begins."""
+    def receive(self, found: DiagnosisData, now_ns: int, *, is_current: bool = True) -> list[Note]:
+        """Decide what follows from a diagnosis; a candidate is then warmed up, and begins.
+
+        Nothing does where it is not of the present model any longer (`is_current`).
+        """
         state, running = self.state, self.state.diagnosis
         if running is None or running.candidate_sha256:
             return []  # what another one has found is warmed up, or begins
         state.diagnosis = None
         self._judge_y(found, running)
-        why = why_nothing(state, self._settings, found, now_ns)
-        if why == "refused" and found.without:
-            return []  # an effect of the calibrated model, about which a person decides
+        why = why_nothing(state, self._settings, found, now_ns) if is_current else "replaced"
+        if why in ("waits", "replaced"):
+            state.left_out = without(state.left_out, running.without)
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
         return [nothing_follows(why, found)] if why else []
@@ -288,7 +277,8 @@ class Loop:
         if before is not None and is_asked(before, self._settings):
             state.diagnosis = None
             return [nothing_follows("in_shadow", found)]
-        last = gives_way(state, self._settings, running.to_utc_ns) if before is None else None
+        is_another = before is None and role_of(found) == "candidate"
+        last = gives_way(state, self._settings, running.to_utc_ns) if is_another else None
         notes = end(self.state, last, "gives_way") if last is not None else []
         if before is not None and before.is_proposed:
             text = "newer parameters of the same effects take over, and are proposed once their own hours show it"
@@ -376,7 +366,7 @@ class Loop:
         state = self.state
         if back:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
-        state.effects = list(effects)
+        state.effects, state.base_effects, state.left_out = list(effects), list(effects), []
         state.forget_errors()
         return self.give_up("by_hand", "a person has changed the model or the configuration")
 

@@ -1,8 +1,8 @@
 """Which models run in shadow beside the present one, and what follows from a diagnosis.
 
 What a diagnosis has found takes a free place; with the effects of a candidate it takes over what that one has shown.
-Where all places are taken the model that promises least gives way. The model before an adoption has a place of its own
-for as long as it is watched: the way back does not depend on what is found meanwhile.
+Where all places are taken the candidate that promises least gives way. A way back has a place of its own: it does not
+depend on what is found meanwhile.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART, CANDIDATES
-from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import LoopState, Place, same_effects
+from compensator.service.loop.state import LoopState, Place, Role, is_fewer, same_effects
 
 #: A model is better so far if it has shown this part of the deviations that it must show.
 LEADS = 0.5
@@ -42,6 +41,13 @@ def role_of(found: DiagnosisData) -> Role:
     return "before" if found.calibrated or found.fewer else "candidate"
 
 
+def role_beside(place: Place, effects: Sequence[str], settings: LoopSettings) -> Role:
+    """Return the role of a model in shadow beside a present one with other effects."""
+    if not is_fewer(place.effects, effects):
+        return "candidate"
+    return "before" if settings.policy == "adopt" else place.role
+
+
 def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, now_ns: int) -> str:
     """Return why no candidate follows from a diagnosis; empty if one does."""
     role = role_of(found)
@@ -52,7 +58,7 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
     if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
         return "unchanged"
     # A model that runs in shadow is compared, and gone back to or adopted, from there.
-    if found.in_shadow and state.taken:
+    if state.place(found.candidate_sha256) is not None:
         return "in_shadow"
     if not found.calibrated and is_avoided(state, found.effects, now_ns):
         return "avoided"
@@ -71,13 +77,13 @@ def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place 
 
 
 def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | None:
-    """Return the model that gives its place to a newcomer with other effects; None if a place is free.
+    """Return the candidate that gives its place to another one with other effects; None if a place is free.
 
     It is the one with the least log likelihood ratio for each hour of evidence (`Place.promise`), of those that have
     been judged for `shadow_h`, where it is noise before, or have had the time for that: what is never compared keeps no
     place. Only where none has, of all. What is proposed stays.
     """
-    if len(state.found) < CANDIDATES:
+    if len(state.candidates) < CANDIDATES:
         return None
 
     def is_new(place: Place) -> bool:
@@ -85,7 +91,7 @@ def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | 
         return place.verdict.hours < settings.shadow_h and not has_time
 
     return min(
-        (place for place in state.found if not place.is_proposed), key=lambda place: (is_new(place), place.promise)
+        (place for place in state.candidates if not place.is_proposed), key=lambda place: (is_new(place), place.promise)
     )
 
 

@@ -26,7 +26,7 @@ from compensator.errors import CompensatorError
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
 from compensator.messages import UNREADABLE
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result
-from compensator.service.loop.loop import StartDiagnosis
+from compensator.service.loop.state import StartDiagnosis
 from compensator.service.loop.weighing import FAILED, Diagnosed, failed
 
 log = logging.getLogger("compensator")

@@ -10,10 +10,9 @@ from compensator.messages import Event
 from compensator.recording.container import Contents
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
+from compensator.service.loop.ending import FAILED_OUTSIDE
 from compensator.service.replay import RecordedStep, setup_of
 
-#: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
-FAILED_OUTSIDE = "failed"
 #: Decisions that a replay must make again.
 _DECIDED = (
     LoopAction.DIAGNOSE,

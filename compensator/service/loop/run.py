@@ -223,9 +223,11 @@ class LoopRun:
 
     def _diagnosed(self, record: Sequence[Outcome], without: str) -> Diagnosed:
         try:
-            return without_effect(self._data, without) if without else self._diagnose(record, self._calibrated)
+            if without:
+                return without_effect(self._data, without, calibrated=self._calibrated)
+            return self._diagnose(record, self._calibrated)
         except CompensatorError as error:
-            return failed(str(error))
+            return failed(str(error), without=without)
 
     def _keep(self, outcome: Outcome) -> None:
         """Keep what a diagnosis or a warm-up needs."""

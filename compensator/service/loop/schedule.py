@@ -1,10 +1,12 @@
 """When a diagnosis begins: at planned times, and while the model errs, each time that this has lasted twice as long.
 
-A model errs, too, when one of its effects has ended. A diagnosis names that late, as most of its record has the effect:
-so the present model without each of its effects is compared first.
+A model errs, too, when one of its effects has ended. A diagnosis shows that late, as most of its record has the effect:
+so while a model errs it is compared with itself without each effect that the loop has added.
 """
 
 from __future__ import annotations
+
+from collections import Counter
 
 from compensator.clock import HOUR_NS, NS
 from compensator.config import Loop as LoopSettings
@@ -24,22 +26,22 @@ def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
 
 
 def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_ns: int) -> list[Note]:
-    """Begin a diagnosis if it is time.
+    """Begin a diagnosis if it is time, or before it what leaves out an effect.
 
     Named is what has lasted long enough to be seen, which nobody knows before: so the first diagnosis of a misfit is
     made after `misfit_h`, and the next one when there is twice as much of it on record.
     """
     since_last_min = (now_ns - state.diagnosed_utc_ns) / (60 * NS)
-    from_ns = now_ns - round(settings.record_h * HOUR_NS)
+    from_ns, errs = now_ns - round(settings.record_h * HOUR_NS), state.misfit_min >= 60.0 * settings.misfit_h
+    effect = _may_have_ended(state, now_ns) if errs else ""
+    if effect:
+        state.left_out = [*state.left_out, effect]
+        state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why="misfit", without=effect)
+        return []
     if planned_ns > state.planned_utc_ns:
         why = "planned"
-    elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_min >= state.misfit_min / 2.0:
+    elif errs and since_last_min >= state.misfit_min / 2.0:
         why = "misfit"
-        without = _may_have_ended(state, now_ns)
-        if without:
-            state.left_out = [*state.left_out, without]
-            state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why, without=without)
-            return []
     else:
         return []
     state.planned_utc_ns, state.diagnosed_utc_ns, state.left_out = planned_ns, now_ns, []
@@ -50,9 +52,9 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
 def _may_have_ended(state: LoopState, now_ns: int) -> str:
     """Return an effect without which the present model is to be compared; empty if there is none.
 
-    Before the loop has adopted a model all effects are those of the calibrated one, which a person decides about.
+    Each once between two diagnoses. About those of the calibrated model a person decides.
     """
-    for effect in dict.fromkeys(state.effects if state.adopted_utc_ns else ()):
+    for effect in Counter(state.effects) - Counter(state.base_effects):
         others = without(state.effects, effect)
         is_compared = any(same_effects(place.effects, others) for place in state.taken)
         if effect not in state.left_out and not is_compared and not is_avoided(state, others, now_ns):

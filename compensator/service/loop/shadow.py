@@ -6,7 +6,6 @@ It passes the same pauses, zeros and probes as the present compensation. Its own
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import msgspec
 
@@ -15,9 +14,8 @@ from compensator.config import Config
 from compensator.events import ComparisonData, EventKind
 from compensator.messages import SCHEMA, Candidate, Probe
 from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.loop.state import Role
 from compensator.service.probing import ReceivedProbe
-
-Role = Literal["candidate", "before"]
 
 
 @dataclass(slots=True)

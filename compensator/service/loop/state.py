@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
@@ -12,12 +14,13 @@ from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.messages import UNREADABLE, check_numbers
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
 STATE_SCHEMA = 4
 
+#: A candidate may be adopted; to a model from before, or with fewer effects, the service goes back.
+Role = Literal["candidate", "before"]
 Phase = Literal["idle", "shadow", "proposed", "watching"]
 Exchange = Literal["", "adopt", "back"]
 #: Before the first value.
@@ -32,6 +35,30 @@ def same_effects(a: Sequence[str], b: Sequence[str]) -> bool:
 def without(effects: Sequence[str], effect: str) -> list[str]:
     """Return effects without one of them."""
     return [one for one in effects if one != effect]
+
+
+def is_fewer(effects: Sequence[str], of: Sequence[str]) -> bool:
+    """Return whether some effects are a part of others, and not all of them.
+
+    Examples
+    --------
+    >>> is_fewer(["a"], ["a", "b"]), is_fewer([], ["a"]), is_fewer(["a"], ["a"]), is_fewer(["c"], ["a", "b"])
+    (True, True, False, False)
+    """
+    return Counter(effects) < Counter(of)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartDiagnosis:
+    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC.
+
+    With `without` it is none: the present model without this effect is wanted.
+    """
+
+    from_utc_ns: int
+    to_utc_ns: int
+    why: str
+    without: str = ""
 
 
 class Running(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,6 +77,13 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     is_next: bool = False
     without: str = ""
 
+    @property
+    def wanted(self) -> StartDiagnosis:
+        """What is begun by it."""
+        return StartDiagnosis(
+            from_utc_ns=self.from_utc_ns, to_utc_ns=self.to_utc_ns, why=self.why, without=self.without
+        )
+
 
 class Place(msgspec.Struct, kw_only=True):
     """A model in shadow, and what was compared of it and the present model.
@@ -61,7 +95,7 @@ class Place(msgspec.Struct, kw_only=True):
     effects : list of str
         Its effects.
     role : {"candidate", "before"}
-        Whether it may be adopted, or is a model that the service goes back to.
+        Whether it may be adopted, or is a model that the service goes back to; beside the present model.
     since_utc_ns : int
         When the comparison began, ns since 1970 UTC.
     level_utc_ns : int
@@ -144,13 +178,13 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     uncompared_ns : int
         Since when, ns since 1970 UTC.
     found : list of Place
-        What diagnoses have found: candidates, and the calibrated model; and the present one without an effect.
+        What diagnoses have found: candidates, and ways back; and the present model without an effect.
     watched : Place, optional
         The model before the last adoption.
     adopted_utc_ns : int
         Time of the last adoption; 0 before.
-    effects : list of str
-        Effects of the present model.
+    effects, base_effects : list of str
+        Effects of the present and of the calibrated model.
     error : ErrorBlocks
         Errors of the present model since the last zero.
     zero_utc_ns : int
@@ -180,6 +214,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     watched: Place | None = None
     adopted_utc_ns: int = 0
     effects: list[str] = []
+    base_effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     zero_utc_ns: int = 0
     y_drifted_ns: int = 0
@@ -235,6 +270,11 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def candidates(self) -> list[Place]:
         """The models in shadow that may be adopted."""
         return [place for place in self.found if place.role == "candidate"]
+
+    @property
+    def ways_back(self) -> list[Place]:
+        """The models in shadow that the service goes back to where they are better."""
+        return [place for place in self.taken if place.role == "before"]
 
     @property
     def candidate(self) -> Place | None:

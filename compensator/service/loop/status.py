@@ -27,7 +27,7 @@ def loop_status(core: ModelLoop, candidates: Sequence[Candidate]) -> LoopStatus:
     before = state.watched if state.watched is not shown else None
     return LoopStatus(
         phase=state.phase,
-        diagnosing=state.diagnosis is not None,
+        diagnosing=state.diagnosis is not None and not state.diagnosis.without,
         model_sha256=shown.sha256 if shown is not None else "",
         effects=shown.effects if shown is not None else [],
         since_utc_ns=shown.since_utc_ns if shown is not None else 0,
@@ -42,5 +42,5 @@ def loop_status(core: ModelLoop, candidates: Sequence[Candidate]) -> LoopStatus:
         adopted_utc_ns=state.adopted_utc_ns,
         before_effects=before.effects if before is not None else None,
         before_text=described(before.verdict) if before is not None else "",
-        others=[f"{named(one.effects)}: {described(one.verdict)}" for one in state.candidates if one is not shown],
+        others=[f"{named(one.effects)}: {described(one.verdict)}" for one in state.found if one is not shown],
     )

@@ -2,14 +2,14 @@
 
 A diagnosis starts from the calibrated model, never from an extension, so an effect that has ended is found as one that
 has begun. The candidate is that model with the effects that can be deployed, or, where nothing is explained, that model
-itself.
+itself. In the place of a diagnosis it may be the present model without an effect.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,9 +24,10 @@ from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, model_of
+from compensator.service.loop.state import is_fewer
 
-#: Verdict of a diagnosis that ended without a result, and of what is none: the present model without an effect.
-FAILED, WITHOUT = "failed", "without"
+#: Verdict of a diagnosis that ended without a result.
+FAILED = "failed"
 _EXPLAINING = ("explained", "partly_explained")
 
 
@@ -61,26 +62,32 @@ class Diagnosed:
     without: str = ""
 
 
-def failed(why: str) -> Diagnosed:
-    """Return a diagnosis that gave nothing."""
-    return Diagnosed(FAILED, (), None, f"the diagnosis failed: {why}", why)
+def failed(why: str, *, without: str = "") -> Diagnosed:
+    """Return a diagnosis that gave nothing, or that the model cannot be made without an effect."""
+    what = f"the model without {without} cannot be made" if without else "the diagnosis failed"
+    return Diagnosed(FAILED, (), None, f"{what}: {why}", why, without=without)
 
 
-def without_effect(present: bytes, effect: str) -> Diagnosed:
+def without_effect(present: bytes, effect: str, *, calibrated: bytes) -> Diagnosed:
     """Return the present model without an effect, which may have ended, in the place of a diagnosis.
+
+    Without its last named effect that is the calibrated model: a remainder was fitted beside what it named.
 
     Raises
     ------
     CompensatorError
-        If it does not have this effect, or its file cannot be used.
+        If the loop has not added this effect, or a file cannot be used.
     """
-    model = parse_model(present, source="present model")
-    kept = tuple(one for one in model.effects if name_of(one) != effect)
-    if len(kept) == len(model.effects):
-        raise ModelError(f"present model: no effect {effect}")
-    less = dataclasses.replace(model, effects=kept)
+    model, base = parse_model(present, source="present model"), parse_model(calibrated, source="calibrated model")
+    own = model.effects[len(base.effects) :]
+    kept = tuple(one for one in own if name_of(one) != effect)
+    if len(kept) == len(own):
+        raise ModelError(f"present model: no effect {effect} beside those of the calibrated one")
     text = f"measured and predicted Y have diverged: the model without {effect}, which may have ended"
-    return Diagnosed(WITHOUT, tuple(effect_names(less)), dump_model(less).encode(), text, without=effect)
+    if all(one.kind == Regression.kind for one in kept):
+        return Diagnosed("", tuple(effect_names(base)), calibrated, text, without=effect)
+    less = dataclasses.replace(model, effects=(*base.effects, *kept))
+    return Diagnosed("", tuple(effect_names(less)), dump_model(less).encode(), text, without=effect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,31 +102,22 @@ class Weighed:
         return Weighed(replace(self.data, seconds=seconds), self.candidate)
 
 
-def weigh(
-    found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel, in_shadow: Collection[str]
-) -> Weighed:
+def weigh(found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel) -> Weighed:
     """Return the candidate that follows from a diagnosis, checked, and its differences.
 
     Parameters
     ----------
     found : Diagnosed
-        Result of the diagnosis of the calibrated model.
+        Result of the diagnosis of the calibrated model, or the present one without an effect.
     config : Config
         Settings of the service.
     calibrated : bytes
         Model file of the configuration, or the last that a person adopted.
     present : ThermalModel
         The present model.
-    in_shadow : collection of str
-        Hashes of the models in shadow.
     """
     base = model_of(config, calibrated, source="calibrated model")
-    explains = bool(found.without) or (found.verdict in _EXPLAINING and bool(found.effects))
-    data = found.model if explains else None
-    if not explains and found.verdict != FAILED and present.sha256 != base.sha256:
-        data = calibrated
-    if data is not None and found.without and not found.effects:
-        data = calibrated
+    data = _candidate_of(found, calibrated, is_extended=present.sha256 != base.sha256)
     plain = without_candidate(found)
     if data is None:
         return Weighed(plain, None)
@@ -137,12 +135,19 @@ def weigh(
         candidate_sha256=model.sha256,
         candidate=model.name,
         fewer=_is_way_back(effects, effect_names(present), found, config),
+        present_sha256=present.sha256,
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
-        in_shadow=model.sha256 in in_shadow,
         calibrated=model.sha256 == base.sha256,
     )
     return Weighed(weighed, data)
+
+
+def _candidate_of(found: Diagnosed, calibrated: bytes, *, is_extended: bool) -> bytes | None:
+    """Return the model file that follows from a diagnosis, which may be the calibrated one; None if none does."""
+    if found.without or (found.verdict in _EXPLAINING and found.effects):
+        return found.model
+    return calibrated if is_extended and found.verdict != FAILED else None
 
 
 def _is_way_back(effects: Sequence[str], present: Sequence[str], found: Diagnosed, config: Config) -> bool:
@@ -151,7 +156,7 @@ def _is_way_back(effects: Sequence[str], present: Sequence[str], found: Diagnose
     Where a person decides only if it is the present model otherwise: that one has been agreed to.
     """
     by_hand = config.loop is None or config.loop.policy == "propose"
-    return set(effects) < set(present) and bool(found.without or not by_hand)
+    return is_fewer(effects, present) and bool(found.without or not by_hand)
 
 
 def without_candidate(found: Diagnosed) -> DiagnosisData:

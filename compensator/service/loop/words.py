@@ -20,6 +20,8 @@ def named(effects: Sequence[str]) -> str:
 def begins(found: DiagnosisData) -> Note:
     """Say what of a diagnosis begins to run in shadow."""
     text = f"a candidate is compared with the present model: {named(found.effects)}"
+    if found.fewer:
+        text = f"fewer effects are compared with those of the present model: {named(found.effects)}"
     if found.calibrated:
         found_again = "nothing is found that the calibrated model lacks"
         if found.verdict != "adequate":
@@ -52,16 +54,16 @@ def does_not_begin(effects: Sequence[str], why: str) -> str:
 
 
 def ended(why: str, verdict: ComparisonData = NO_VERDICT) -> str:
-    """Return why a shadow has ended."""
+    """Return why a model is compared no longer."""
     return {
-        "limits": "the candidate reaches limits that the present model keeps",
-        "worse": f"the candidate is worse: {described(verdict)}",
-        "no_answer": f"nobody answered the proposal: {described(verdict)}",
-        "gives_way": f"the place is needed, and this one promises least: {described(verdict)}",
-        "no_difference": f"the candidate shows no clear difference: {described(verdict)}",
-        "watched": f"the model before is no longer compared: {described(verdict)}",
-        "dismissed": "the candidate is dismissed by an operator",
-        "avoided": "the service goes back from the effects of the candidate",
+        "limits": "it reaches limits that the present model keeps",
+        "worse": f"it is worse; {described(verdict)}",
+        "no_answer": f"nobody answered the proposal; {described(verdict)}",
+        "gives_way": f"the place is needed, and this one promises least; {described(verdict)}",
+        "no_difference": f"it has shown no clear difference for `watch_h`; {described(verdict)}",
+        "watched": f"the last change was `watch_h` ago; {described(verdict)}",
+        "dismissed": "an operator has dismissed it",
+        "avoided": "the service has gone back from its effects",
         "was_wrong": "a temperature was wrong while it was found or compared, as measured Y shows now",
         "replaced": "another model has replaced the present one",
         "interrupted": "the service was interrupted before it began",
@@ -93,14 +95,17 @@ def wait_over(since_utc_ns: int, *, is_compared: bool) -> Note:
 def nothing_follows(why: str, found: DiagnosisData) -> Note:
     """Say why nothing follows from a diagnosis."""
     effects = named(found.effects)
+    if found.without:
+        effects = f"the model without {found.without}"
     words = {
-        "failed": f"the diagnosis failed: {found.needs}",
+        "failed": f"{f'{effects} cannot be made' if found.without else 'the diagnosis failed'}: {found.needs}",
         "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
         "refused": f"the candidate cannot be used: {found.refused}",
         "nothing_found": f"the diagnosis finds nothing that can be compensated; {found.needs}",
         "unchanged": f"the diagnosis finds what the model has: {effects}",
         "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
         "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
+        "replaced": f"{effects}: another model has replaced the present one meanwhile; looked for again later",
         "waits": f"{effects}: waits while another model takes over; looked for again later",
     }
     data = LoopData(step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256)
