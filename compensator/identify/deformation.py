@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
 from compensator.errors import DataError
-from compensator.identify.choice import Candidate, choose
+from compensator.identify.choice import Candidate, Tried, choose
 from compensator.identify.output_error import OutputErrorFit, Prior, Segment, Structure
 from compensator.identify.rest import settle_starts
 from compensator.identify.settings import Settings
@@ -145,7 +146,7 @@ def fit_deformation(
         structures = [Structure(order=settings.order[0], terms=(settings.order[1],), prior=prior)]
     else:
         orders = range(1, settings.max_order + 1)
-        structures = [Structure(order=n, terms=(m,), prior=prior) for n in orders for m in _terms(n)]
+        structures = [Structure(order=n, terms=(n,), prior=prior) for n in orders]
     segments, candidates, result = _chosen(rest, structures, settings, period_s, progress)
     return DeformationFit(
         dtf=PathFit.of("DTF", result),
@@ -173,9 +174,8 @@ def _together(
         structures = [Structure(order=n, terms=(nb_dtf, nb_tdtf), prior=prior)]
     else:
         structures = [
-            Structure(order=n, terms=(m, k), prior=prior)
+            Structure(order=n, terms=(n, k), prior=prior)
             for n in range(1, settings.max_order + 1)
-            for m in _terms(n)
             for k in range(1, n + 1)
         ]
     segments, candidates, result = _chosen(data, structures, settings, period_s, progress)
@@ -198,21 +198,25 @@ def _prior(runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector]) 
     return Prior(noise=max(run.y_noise_um for run in runs), gains=(gain, AMBIENT_UM_PER_K), spread=spread)
 
 
-def _terms(order: int) -> tuple[int, ...]:
-    """Return the numbers of numerator terms to consider: one for each mode."""
-    return (order,)
-
-
 def _chosen(
     data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
     """Determine how the runs start, choose a structure on the held-out blocks and fit it to all data."""
-    largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
-    segments, known = settle_starts(data, largest, period_s, settings.folds)
+    segments, known = _settled(data, structures[: len(structures) // 2 + 1], settings.folds, period_s)
     candidates, result = choose(
         segments, structures, period_s=period_s, folds=settings.folds, known=known, progress=progress
     )
     return segments, candidates, result
+
+
+def _settled(
+    data: Sequence[Segment], structures: Sequence[Structure], folds: int, period_s: float
+) -> tuple[list[Segment], Tried]:
+    """Determine how the runs start with the largest structure for which the data are enough."""
+    for structure in reversed(structures[1:]):
+        with suppress(DataError):
+            return settle_starts(data, structure, period_s, folds)
+    return settle_starts(data, structures[0], period_s, folds)
 
 
 def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:

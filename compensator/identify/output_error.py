@@ -98,7 +98,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """Structure of a fit: common denominator order, and numerator terms and delay of each input.
+    """Structure of a fit: common denominator order, and numerator terms of each input.
 
     Parameters
     ----------
@@ -106,15 +106,12 @@ class Structure:
         Number of poles, nf.
     terms : tuple of int
         Numerator terms of each input, nb.
-    offset : bool
-        Whether the output has an unknown zero.
     prior : Prior, optional
         What is known of the amplitudes; by default nothing.
     """
 
     order: int
     terms: tuple[int, ...]
-    offset: bool = True
     prior: Prior | None = None
 
     def __post_init__(self) -> None:
@@ -165,8 +162,6 @@ class OutputErrorFit:
         size is the number of samples over it.
     rank_deficit : int
         Directions of the amplitudes that the data does not determine.
-    evaluations : int
-        Evaluations of the model in the search.
     """
 
     structure: Structure
@@ -180,7 +175,6 @@ class OutputErrorFit:
     sigma: float
     variance_inflation: float
     rank_deficit: int
-    evaluations: int
 
     @property
     def taus_std_min(self) -> Vector:
@@ -213,7 +207,7 @@ class OutputErrorFit:
         poles = poles_of(self.taus_min, self.period_s)
         columns = _input_columns(u, poles, self.structure)
         response: Vector = np.asarray(columns @ self.amplitudes)
-        slopes = pole_slopes(poles, self.taus_min, self.period_s)
+        slopes = pole_slopes(self.taus_min, self.period_s)
         gradient = np.column_stack((_sensitivities(response, poles, slopes), columns))
         variance = np.einsum("ij,jk,ik->i", gradient, self.covariance, gradient)
         return response, np.sqrt(np.maximum(variance, 0.0))
@@ -221,7 +215,7 @@ class OutputErrorFit:
     def free_decay(self, segment: int, n: int) -> Vector:
         """Return the share of a segment's fitted initial state in `n` samples, without its offset."""
         own = self.nuisances[segment]
-        states = own[: own.size - int(self.structure.offset)]
+        states = own[:-1]
         if states.size == 0:
             return np.zeros(n)
         blank = Segment.of(np.zeros((1, n)), np.zeros(n))
@@ -230,7 +224,7 @@ class OutputErrorFit:
 
     def offset(self, segment: int) -> float:
         """Return the fitted zero of a segment's output."""
-        return float(self.nuisances[segment][-1]) if self.structure.offset else 0.0
+        return float(self.nuisances[segment][-1])
 
     def about_own_start(self, residual: Vector, segment: Segment) -> Vector:
         """Return the residual of a segment less what its zero and initial state explain of its samples used."""
@@ -256,7 +250,7 @@ class OutputErrorFit:
         a = np.poly(poles) if n else np.ones(1)
         jacobian = np.zeros((b.size + n, self.covariance.shape[0]))
         jacobian[: b.size, n + first : n + first + m] = scale * differences
-        slopes = pole_slopes(poles, self.taus_min, self.period_s)
+        slopes = pole_slopes(self.taus_min, self.period_s)
         for i in range(n):
             others = np.poly(np.delete(poles, i)) if n > 1 else np.ones(1)
             jacobian[: b.size, i] = -b / (1.0 - poles[i]) * slopes[i]
@@ -270,7 +264,7 @@ def poles_of(taus_min: Vector, period_s: float) -> Vector:
     return np.asarray((2.0 * taus_min - period) / (2.0 * taus_min + period))
 
 
-def pole_slopes(poles: Vector, taus_min: Vector, period_s: float) -> Vector:
+def pole_slopes(taus_min: Vector, period_s: float) -> Vector:
     """Return dp / d log τ."""
     period = period_s / 60.0
     return np.asarray(4.0 * period * taus_min / (2.0 * taus_min + period) ** 2)
@@ -304,7 +298,7 @@ def _input_columns(u: Matrix, poles: Vector, structure: Structure) -> Matrix:
 
 def _nuisance_columns(segment: Segment, poles: Vector, structure: Structure) -> Matrix:
     n, states = segment.y.size, 0 if segment.rest else poles.size
-    table = np.ones((n, states + structure.offset))
+    table = np.ones((n, states + 1))
     if states:
         impulse = np.zeros(n)
         impulse[0] = 1.0
@@ -342,7 +336,6 @@ class _Problem:
         prior = np.zeros(sum(self.states) + (structure.amplitudes if structure.prior else 0))
         self.y = np.concatenate([*(segment.y[segment.used] for segment in segments), prior])
         self.count = self.y.size - prior.size
-        self.evaluations = 0
         self._at: Vector | None = None
 
     def columns(self, poles: Vector) -> list[tuple[Matrix, Matrix]]:
@@ -379,7 +372,6 @@ class _Problem:
         if self._at is not None and np.array_equal(log_taus, self._at):
             return
         self._at = log_taus.copy()
-        self.evaluations += 1
         self.taus = np.exp(log_taus)
         self.poles = poles_of(self.taus, self.period_s)
         self.parts = self.columns(self.poles)
@@ -399,7 +391,7 @@ class _Problem:
         width = self.structure.amplitudes
         result, column = [], width
         for inputs, nuisance in self.parts:
-            states = nuisance.shape[1] - int(self.structure.offset)
+            states = nuisance.shape[1] - 1
             free = nuisance[:, :states] @ self.coefficients[column : column + states]
             result.append(inputs @ self.coefficients[:width] + free)
             column += nuisance.shape[1]
@@ -407,7 +399,7 @@ class _Problem:
 
     def sensitivities(self) -> Matrix:
         """Return ∂ŷ / ∂ log τ at fixed amplitudes on the samples used."""
-        slopes = pole_slopes(self.poles, self.taus, self.period_s)
+        slopes = pole_slopes(self.taus, self.period_s)
         parts = zip(self.outputs(), self.used, strict=True)
         tables: list[Matrix] = [_sensitivities(out, self.poles, slopes)[used] for out, used in parts]
         prior = np.zeros((self.y.size - self.count, self.poles.size))
@@ -462,7 +454,7 @@ def fit_output_error(
     (2.0, [9.5])
     """
     problem = _Problem(segments, structure, period_s)
-    needed = structure.parameters + sum(structure.order * (not s.rest) + structure.offset for s in segments)
+    needed = structure.parameters + sum(structure.order * (not s.rest) + 1 for s in segments)
     if problem.count <= needed:
         raise DataError(f"{problem.count} measured sample(s) for {needed} parameters ({structure})")
     search(problem, starts, bounds_of(problem, period_s))
@@ -560,7 +552,6 @@ def result_of(problem: _Problem) -> OutputErrorFit:
         sigma=sigma,
         variance_inflation=inflation,
         rank_deficit=problem.deficit,
-        evaluations=problem.evaluations,
     )
 
 

@@ -206,3 +206,10 @@ def test_the_command_takes_the_standard_deviation(tmp_path, capsys):
     assert "--y-std UM" in capsys.readouterr().err
     assert main(["identify", str(data), "--out", str(out), "--order", "3", "3", "2", "--y-std", "1.5"]) == 0
     assert "measured values" in (tmp_path / "m" / "model-calibration.html").read_text()
+
+
+def test_few_values_in_several_records_are_enough_for_a_small_structure():
+    """Of 28 values in four parts a middle structure has 29 parameters: a smaller one shows how the records start."""
+    records = [probed(seed, every=100, hours=12.0) for seed in range(3, 8)]
+    assert sum(np.isfinite(one["y_um"]).sum() for one in records) == 35
+    assert tc.identify(records, y_std_um=STD_UM).model.dtf.gain_with_std()[0] > 0.0
