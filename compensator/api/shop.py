@@ -24,6 +24,7 @@ from compensator.recording.container import Container
 from compensator.recording.reading import in_order, recordings_in
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.run import LoopRun
+from compensator.service.loop.state import same_effects
 from compensator.service.probing import ReceivedProbe
 from compensator.service.replay import RecordedStep, execute, setup_of, steps_in
 from compensator.service.status import Zero
@@ -203,6 +204,8 @@ class _Summary:
         self._counts[step] += 1
         if step == LoopAction.SHADOW:
             self._found = effects
+            if self._proposed and same_effects(effects, self._proposed):
+                self._proposed_sha256 = data.get("model_sha256", "")  # newer parameters are proposed in their place
         if step == LoopAction.PROPOSE:
             self._proposed, self._proposed_sha256 = effects, data.get("model_sha256", "")
         elif step in _NOT_PROPOSED and data.get("model_sha256", "") == self._proposed_sha256:

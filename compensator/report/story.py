@@ -35,7 +35,7 @@ _BY_LOOP, _BY_OPERATOR = "the loop", "an operator"
 _NS, _HALF_DAY_S = 1e-9, 43200.0
 #: Steps in words; those of every night are counted.
 WORDS: Mapping[str, str] = {
-    LoopAction.SHADOW: "candidate begins in shadow",
+    LoopAction.SHADOW: "comparison begins",
     LoopAction.PROPOSE: "proposed",
     LoopAction.WITHDRAW: "proposal withdrawn",
     LoopAction.ADOPT: "adopted",

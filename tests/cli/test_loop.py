@@ -88,6 +88,14 @@ def test_a_proposal_asks_something_of_a_person_whatever_happens_to_other_models(
     assert one["proposed"] == proposed and bool(one["needs"]) == bool(proposed)
 
 
+def test_newer_parameters_of_a_proposal_take_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newer = LoopData(step=LoopAction.SHADOW, role="candidate", model_sha256="b" * 64, effects=["gain:DTF"])
+    falls = LoopData(step=LoopAction.WITHDRAW, role="candidate", model_sha256="b" * 64)
+    told = (*TOLD, (350, "loop", "newer", newer.table()), (360, "loop", "falls", falls.table()))
+    (one,) = result([str(recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=told))], capsys)
+    assert one["proposed"] == [] and not one["needs"]
+
+
 def finds_nothing(seen: list[Any]) -> Any:
     """Diagnoses that find nothing, and are counted with what they were given."""
 

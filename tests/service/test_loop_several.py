@@ -436,10 +436,12 @@ def test_newer_parameters_of_what_a_person_dismisses_do_not_begin() -> None:
     assert loop.begin() == [] and loop.state.diagnosis is None and not loop.state.found
 
 
-def test_a_proposal_that_is_taken_over_is_withdrawn() -> None:
+def test_newer_parameters_of_what_waits_for_a_zero_wait_for_it_too() -> None:
     loop = newer_parameters()
     loop.state.found[0].is_proposed = True
-    assert about(loop.begin()) == [("withdraw", "taken_over"), ("shadow", "")]
+    assert about(loop.begin()) == [("shadow", "")]
+    loop.shadow_begins("b" * 64, ["gain DTF", "input:coolant_degc"], NOW_NS)
+    assert [(one.sha256[0], one.is_proposed) for one in loop.state.found] == [("b", True)]
 
 
 def test_what_is_in_force_again_does_not_run_beside_itself() -> None:

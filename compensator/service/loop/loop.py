@@ -280,9 +280,6 @@ class Loop:
         is_another = before is None and role_of(found) == "candidate"
         last = gives_way(state, self._settings, running.to_utc_ns) if is_another else None
         notes = end(self.state, last, "gives_way") if last is not None else []
-        if before is not None and before.is_proposed:
-            text = "newer parameters of the same effects take over, and are proposed once their own hours show it"
-            notes += withdraw(self.state, before, text, why="taken_over")
         state.diagnosis = msgspec.structs.replace(running, is_next=True)
         return [*notes, begins(found)]
 
@@ -303,6 +300,7 @@ class Loop:
         place.error = error if error is not None else ErrorBlocks()
         if before is not None:
             self.compared(place).go_on_with(before, now_ns)
+            place.is_proposed = before.is_proposed  # a person is asked for the same: a zero
             state.remove(before)
         state.found, state.diagnosis = [*state.found, place], None
 
