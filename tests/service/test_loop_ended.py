@@ -155,6 +155,10 @@ def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
     loop = Loop(LoopSettings(), 60.0, EFFECTS, misfit())
     loop.model_changed(EFFECTS, NOW_NS)
     assert begun(loop.state) == ("misfit", "")
+    # Back to what the loop had adopted before, these are still its own.
+    loop = Loop(LoopSettings(), 60.0, [*EFFECTS, "delay:DTF"], misfit())
+    loop.model_changed(EFFECTS, NOW_NS, back=True)
+    assert begun(loop.state) == ("misfit", EFFECTS[0])
 
 
 def test_the_last_effect_ends_long_after_the_model_before_it_was_compared() -> None:

@@ -364,7 +364,9 @@ class Loop:
         state = self.state
         if back:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
-        state.effects, state.base_effects, state.left_out = list(effects), list(effects), []
+        else:
+            state.base_effects = list(effects)
+        state.effects, state.left_out = list(effects), []
         state.forget_errors()
         return self.give_up("by_hand", "a person has changed the model or the configuration")
 
