@@ -219,7 +219,8 @@ class Trials:
             y_um=np.full(self._t_h.size, np.nan),
             heat_w=None,
             reference=self.evidence.runs[0].reference,
-            channels={name: self._start(name) + change(name) for name in context.channels},
+            # A fluid that stayed as warm as it was is no channel to look for, but an effect may need it.
+            channels={name: self._start(name) + change(name) for name in self.evidence.signals[0].channels},
         )
         return signals_of(model, run, len(self.evidence.signals))
 

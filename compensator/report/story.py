@@ -319,7 +319,8 @@ def story_tables(story: Story) -> list[Block]:
 
 def _row(step: Step) -> list[Cell]:
     found = step.comparison
-    model = f"{step.model_sha256[:6]} {', '.join(step.effects)}".strip()
+    effects = ", ".join(step.effects) or ("no added effect" if step.model_sha256 else "")
+    model = f"{step.model_sha256[:6]} {effects}".strip()
     figures = ["", ""]
     if found is not None:
         compared = {axis: _figures(one) for axis, one in found.by_axis().items()}

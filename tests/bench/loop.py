@@ -45,7 +45,6 @@ import compensator as tc
 from compensator.api.loop import diagnosis_in_process
 from compensator.demo.offline import probe_of, run_alone
 from compensator.errors import CompensatorError
-from compensator.events import EventKind
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopRun
@@ -101,8 +100,7 @@ class Service:
         self._kept, self._state = 0, self.run.state()
 
     def process(self, sample, probe, is_visit):
-        waits = self.steps and any(is_begin(note) for note in self.steps[-1][2].events)
-        if len(self.steps) - self._kept >= STATE_EVERY and not waits:
+        if len(self.steps) - self._kept >= STATE_EVERY and not self.run.has_result:
             self._kept, self._state = len(self.steps), self.run.state()
         step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
         self.steps.append((sample, probe, step, is_visit))
@@ -133,11 +131,6 @@ def advance(run, last, sample, probe, is_visit):
         run.resume()
         run.compensation.zero("warm")
     return run.process(sample, [probe] if probe is not None else [])
-
-
-def is_begin(note):
-    """Return whether a diagnosis begins with this event: its result is not in a state yet."""
-    return note.kind == EventKind.LOOP and note.data["step"] == "diagnose"
 
 
 def seen(step):

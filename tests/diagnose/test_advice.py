@@ -368,3 +368,12 @@ def test_what_needs_no_advice_has_none():
     found = diagnose(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 60, 14.0)))
     assert found.verdict == "adequate" and found.advice is None
     assert figures(found)["advice"] is None
+
+
+def test_a_test_has_what_an_effect_needs_although_it_stayed_as_it_was():
+    """The fluid of a flow may be a channel that nothing moves: it is no channel to look for."""
+    n = int(HOURS * 60)
+    evidence = evidence_of(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 31, floor_degc=np.full(n, 21.5))))
+    assert "floor_degc" not in evidence.context.channels
+    trials = Trials(evidence)
+    assert all(np.all(trial.signals.channels["floor_degc"] == 21.5) for trial in trials.of(["coolant_flow_lpm"]))

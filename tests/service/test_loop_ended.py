@@ -130,8 +130,17 @@ def test_each_effect_is_left_out_once_before_a_diagnosis_planned_or_not() -> Non
     for planned_ns in (NOW_NS, NOW_NS - 6 * HOUR_NS):
         state = misfit(planned_utc_ns=planned_ns)
         assert [begun(state)[1] for _ in range(3)] == [*EFFECTS, ""]
-        # What is compared no longer by then is compared again.
-        assert begun(state, 1.0)[1] == EFFECTS[0]
+        # What is compared no longer is compared again when the misfit has lasted twice as long.
+        state.diagnosed_utc_ns = NOW_NS + HOUR_NS
+        assert begin_if_due(state, LoopSettings(), NOW_NS + HOUR_NS, NOW_NS) == [] and state.diagnosis is None
+        assert begun(state, 2.0)[1] == EFFECTS[0]
+
+
+def test_what_was_to_be_left_out_is_so_although_the_alarm_is_over_for_a_moment() -> None:
+    state = misfit()
+    begun(state)
+    state.misfit_min = 0.0
+    assert begun(state)[1] == "gain:DTF"
 
 
 def test_frequent_diagnoses_keep_nothing_from_being_left_out() -> None:
@@ -161,19 +170,21 @@ def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
     assert begun(loop.state) == ("misfit", EFFECTS[0])
 
 
-def test_the_last_effect_ends_long_after_the_model_before_it_was_compared() -> None:
-    """The diagnoses name it all the time: most of their records have it."""
+@pytest.mark.parametrize("watch_h", [24.0, 168.0])
+def test_the_last_effect_ends_whether_the_model_before_it_is_still_watched_or_not(watch_h: float) -> None:
+    """The diagnoses name it all the time: most of their records have it. So has what was compared until the misfit."""
     ends = 3 * DAY
-    tables = {"loop": NIGHTLY | {"watch_h": 24.0}} | CHECKED
+    tables = {"loop": NIGHTLY | {"watch_h": watch_h}} | CHECKED
     loop = LoopRun(settings(**tables), QUILL_FILE, Night(shown(extended())))
     steps = run(loop, machine(4 * DAY, lambda i: float(i < ends)))
     found = decisions(steps)
     (back,) = [seq for seq, step, _ in found if step == "back"]
-    assert ("end", "watched") in [one[1:] for one in found if one[0] < ends] and ends < back < ends + DAY // 2
+    assert ends < back < ends + 10 * 60
+    assert (("end", "watched") in [one[1:] for one in found if one[0] < ends]) is (watch_h == 24.0)
     assert steps[-1].model_sha256 == sha256_of(QUILL_FILE)
 
 
-@pytest.mark.parametrize("how", ["restart", "wrong temperature", "another model", "exchange"])
+@pytest.mark.parametrize("how", ["restart", "wrong temperature", "exchange"])
 def test_what_is_interrupted_is_begun_again(how: str) -> None:
     state = misfit()
     begun(state)
@@ -184,9 +195,6 @@ def test_what_is_interrupted_is_begun_again(how: str) -> None:
         assert loop.restarted() == []
     elif how == "wrong temperature":
         loop._forget_wrong()
-    elif how == "another model":
-        weighed = DiagnosisData(verdict="", candidate_sha256="b" * 64, without="gain:DTF", fewer=True)
-        assert about(loop.receive(weighed, NOW_NS, is_current=False)) == [("nothing", "replaced")]
     else:
         state.found = [one("c", *EFFECTS, "delay:DTF", role="candidate")]
         loop.accept()

@@ -140,10 +140,10 @@ class Stands:
     def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
         self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
         self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
-        self.level_at_return_um = 0.0
+        self.level_at_return_um, self.goes_back = 0.0, True
 
     def is_better_to_go_back_to(self, *, is_new: bool) -> bool:
-        return True
+        return self.goes_back
 
     def is_better(self, now_ns: int) -> bool:
         return True
@@ -182,8 +182,12 @@ def test_of_several_ways_back_the_one_is_taken_that_shows_most_and_no_other_surp
     before, fewer = place("a", 9.0, role="before"), place("b", 5.0, role="before")
     assert chosen(Stands(before), Stands(fewer, "a")) == [("back", "b")]
     assert chosen(Stands(fewer), Stands(before)) == [("back", "a")]
-    # A way back comes before what is new.
+    # A way back comes before what is new, and what it surpasses is not adopted before it has shown enough by itself.
     assert chosen(Stands(place("c", 9.0)), Stands(fewer)) == [("back", "b")]
+    for surpasses, decisions_made in (("c", []), ("", [("adopt", "c")])):
+        waits = Stands(place("b", 1.0, role="before"), surpasses)
+        waits.goes_back = False
+        assert chosen(Stands(place("c", 9.0)), waits) == decisions_made
 
 
 def test_a_pair_of_candidates_is_compared_once() -> None:

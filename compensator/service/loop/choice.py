@@ -1,7 +1,7 @@
 """Which of the candidates that are better than the present model is adopted or proposed.
 
-One that no other candidate surpasses: that is clearly better on the hours of both, by the rule of the verdict with the
-first one as the present model. Of several the one that shows most.
+One that no other candidate and no way back surpasses: that is clearly better on the hours of both, by the rule of the
+verdict with the first one as the present model. Of several the one that shows most.
 
 One that has all effects of another one and more, and cannot be adopted yet because its level is not known, does not
 keep that one out: measured Y speaks for the further effects and not against those of both. It goes on beside it.
@@ -110,7 +110,8 @@ class Choice:
         return not any(leads(place.verdict, self._settings) for place in state.ways_back)
 
     def _surpassing(self, place: Place) -> Iterator[Place]:
-        return (one for one in self._state.candidates if one is not place and self._surpasses(one, place))
+        others = (*self._state.candidates, *self._state.ways_back)
+        return (one for one in others if one is not place and self._surpasses(one, place))
 
     def _surpasses(self, place: Place, rival: Place) -> bool:
         return is_clearly_better(self.beside(place, rival))

@@ -87,6 +87,14 @@ class Compared:
         self.judge()
         return True
 
+    def forget_before(self, time_utc_ns: int) -> None:
+        """Forget what was compared before a time, but for so many probes as a candidate needs."""
+        state = self._place.comparison
+        before = len(state.blocks), len(state.probes)
+        self._comparison.forget_before(time_utc_ns, self._settings.probes)
+        if before != (len(state.blocks), len(state.probes)):
+            self.judge()
+
     def judge(self) -> None:
         """Make the verdict anew.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.place import role_of
-from compensator.service.loop.state import LoopState, Place, without
+from compensator.service.loop.state import LoopState, Place
 from compensator.service.loop.words import does_not_begin, ended, named
 
 #: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
@@ -60,7 +60,7 @@ def end_diagnosis(state: LoopState, why: str, text: str = "") -> list[Note]:
     """
     running, state.diagnosis = state.diagnosis, None
     if running is not None and running.without and why != FAILED_OUTSIDE:
-        state.left_out = without(state.left_out, running.without)
+        state.to_leave_out = [running.without, *state.to_leave_out]
     if running is None or running.found is None or not running.is_next:
         return []
     found = running.found

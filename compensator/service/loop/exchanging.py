@@ -54,7 +54,7 @@ def exchanged(
     running, notes = state.diagnosis, list[Note]()
     if running is not None and (running.candidate_sha256 or running.without):
         notes += end_diagnosis(state, "replaced")  # it was weighed beside the model that has gone
-    state.left_out = []
+    state.forget_left_out()
     for place in state.found:
         place.role = role_beside(place, incoming.effects, settings)
     for place in state.found:

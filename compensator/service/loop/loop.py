@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from compensator.clock import HOUR_NS
+from compensator.clock import HOUR_NS, NS
 from compensator.config import Loop as LoopSettings
 from compensator.diagnose.change import BLOCK_MIN
 from compensator.errors import ServiceError
@@ -33,8 +33,8 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
-from compensator.service.loop.state import LoopState, Place, Role, Running, StartDiagnosis, same_effects, without
+from compensator.service.loop.schedule import begin_again, begin_if_due, errs, pass_planned
+from compensator.service.loop.state import LoopState, Place, Role, Running, StartDiagnosis, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -115,6 +115,10 @@ class Loop:
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
         record_ns = round(self._settings.record_h * HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
+        if errs(state, self._settings):
+            # What was compared before says nothing of an effect that has ended since.
+            for place in state.ways_back:
+                self.compared(place).forget_before(now_ns - round(state.misfit_min * 60 * NS))
         state.error.update(present)
         if sets_zero(present):
             state.zero_utc_ns, state.y_drifted_ns = now_ns, 0
@@ -246,8 +250,6 @@ class Loop:
         state.diagnosis = None
         self._judge_y(found, running)
         why = why_nothing(state, self._settings, found, now_ns) if is_current else "replaced"
-        if why in ("waits", "replaced"):
-            state.left_out = without(state.left_out, running.without)
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)
         return [nothing_follows(why, found)] if why else []
@@ -366,9 +368,11 @@ class Loop:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
         else:
             state.base_effects = list(effects)
-        state.effects, state.left_out = list(effects), []
+        state.effects = list(effects)
         state.forget_errors()
-        return self.give_up("by_hand", "a person has changed the model or the configuration")
+        notes = self.give_up("by_hand", "a person has changed the model or the configuration")
+        state.forget_left_out()
+        return notes
 
     def give_up(self, why: str, text: str) -> list[Note]:
         """End everything that is in shadow, and a diagnosis, for a cause outside of the loop."""

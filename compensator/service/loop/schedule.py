@@ -29,35 +29,42 @@ def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_
     """Begin a diagnosis if it is time, or before it what leaves out an effect.
 
     Named is what has lasted long enough to be seen, which nobody knows before: so the first diagnosis of a misfit is
-    made after `misfit_h`, and the next one when there is twice as much of it on record.
+    made after `misfit_h`, and the next one when there is twice as much of it on record. So is an effect left out.
     """
-    since_last_min = (now_ns - state.diagnosed_utc_ns) / (60 * NS)
-    from_ns, errs = now_ns - round(settings.record_h * HOUR_NS), state.misfit_min >= 60.0 * settings.misfit_h
-    effect = _may_have_ended(state, now_ns) if errs else ""
+
+    def lasts_twice_as_long(since_ns: int) -> bool:
+        return errs(state, settings) and (now_ns - since_ns) / (60 * NS) >= state.misfit_min / 2.0
+
+    from_ns = now_ns - round(settings.record_h * HOUR_NS)
+    if lasts_twice_as_long(state.left_out_utc_ns):
+        state.left_out_utc_ns, state.to_leave_out = now_ns, list(Counter(state.effects) - Counter(state.base_effects))
+    effect = _may_have_ended(state, now_ns)
     if effect:
-        state.left_out = [*state.left_out, effect]
         state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why="misfit", without=effect)
         return []
     if planned_ns > state.planned_utc_ns:
         why = "planned"
-    elif errs and since_last_min >= state.misfit_min / 2.0:
+    elif lasts_twice_as_long(state.diagnosed_utc_ns):
         why = "misfit"
     else:
         return []
-    state.planned_utc_ns, state.diagnosed_utc_ns, state.left_out = planned_ns, now_ns, []
+    state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
     state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
     return [_begins(state.diagnosis)]
 
 
-def _may_have_ended(state: LoopState, now_ns: int) -> str:
-    """Return an effect without which the present model is to be compared; empty if there is none.
+def errs(state: LoopState, settings: LoopSettings) -> bool:
+    """Return whether measured and predicted Y have diverged for long."""
+    return state.misfit_min >= 60.0 * settings.misfit_h
 
-    Each once between two diagnoses. About those of the calibrated model a person decides.
-    """
-    for effect in Counter(state.effects) - Counter(state.base_effects):
+
+def _may_have_ended(state: LoopState, now_ns: int) -> str:
+    """Return the next effect without which the present model is to be compared, and is not yet; empty without one."""
+    while state.to_leave_out:
+        effect, *state.to_leave_out = state.to_leave_out
         others = without(state.effects, effect)
         is_compared = any(same_effects(place.effects, others) for place in state.taken)
-        if effect not in state.left_out and not is_compared and not is_avoided(state, others, now_ns):
+        if not is_compared and not is_avoided(state, others, now_ns):
             return effect
     return ""
 

@@ -161,8 +161,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
         A diagnosis that was begun.
-    left_out : list of str
-        Effects of the present model without which it was to be compared since the last diagnosis.
+    left_out_utc_ns, to_leave_out : int, list of str
+        When it was last decided to compare the present model without each effect that the loop has added, ns since 1970
+        UTC; 0 before. And those that are still to be left out.
     planned_utc_ns, diagnosed_utc_ns : int
         The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min : float
@@ -201,7 +202,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     incoming: str = ""
     level_um: float = 0.0
     diagnosis: Running | None = None
-    left_out: list[str] = []
+    left_out_utc_ns: int = 0
+    to_leave_out: list[str] = []
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
@@ -240,6 +242,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
             For how long effects are avoided at most, h.
         """
         self.diagnosed_utc_ns = min(self.diagnosed_utc_ns, now_ns)
+        self.left_out_utc_ns = min(self.left_out_utc_ns, now_ns)
         self.adopted_utc_ns = min(self.adopted_utc_ns, now_ns)
         self.zero_utc_ns = min(self.zero_utc_ns, now_ns)
         self.y_drifted_ns = min(self.y_drifted_ns, now_ns)
@@ -260,6 +263,10 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         """Let a model go."""
         self.watched = None if place is self.watched else self.watched
         self.found = [one for one in self.found if one is not place]
+
+    def forget_left_out(self) -> None:
+        """Begin anew to leave out effects, with another model."""
+        self.left_out_utc_ns, self.to_leave_out = 0, []
 
     def forget_errors(self) -> None:
         """Forget what was wrong with the model before."""

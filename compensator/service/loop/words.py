@@ -97,9 +97,12 @@ def nothing_follows(why: str, found: DiagnosisData) -> Note:
     effects = named(found.effects)
     if found.without:
         effects = f"the model without {found.without}"
+    unexplained = f"the diagnosis explains nothing that can be compensated ({found.verdict})"
+    if found.verdict == "explained":
+        unexplained = "what the diagnosis explains cannot be compensated"
     words = {
         "failed": f"{f'{effects} cannot be made' if found.without else 'the diagnosis failed'}: {found.needs}",
-        "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
+        "unexplained": f"{unexplained}; {found.needs}",
         "refused": f"the candidate cannot be used: {found.refused}",
         "nothing_found": f"the diagnosis finds nothing that can be compensated; {found.needs}",
         "unchanged": f"the diagnosis finds what the model has: {effects}",
