@@ -77,8 +77,6 @@ def diagnoses_of_table(table: Table, model: bytes, *, probe_std_um: float | None
     CompensatorError
         If there is too little data.
     """
-    if not np.isfinite(table.columns["y_um"]).any():
-        raise DataError(f"{table.name}: no measured Y that may be used")
     base = parse_model(model, source="calibrated model")
     whole = best = last = Part.of(table, base, probe_std_um)
     while last.left > WELL_EXPLAINED:
@@ -165,6 +163,8 @@ def _end_of(table: Table, from_s: float) -> Table | None:
 
 
 def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:
+    if not np.isfinite(table.columns["y_um"]).any():
+        raise DataError(f"{table.name}: no measured Y that may be used")
     columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
     table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))

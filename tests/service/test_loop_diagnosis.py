@@ -11,6 +11,7 @@ import compensator.api.loop as api
 from compensator.api.diagnosis import DiagnosisResult
 from compensator.api.loop import Part, _diagnosed, diagnoses_of_table, diagnosis_of_record
 from compensator.clock import NS
+from compensator.data.measurement import Measurement
 from compensator.data.table import Table
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import usable_table
@@ -78,3 +79,18 @@ def test_what_is_after_the_change_of_the_residual_is_diagnosed_again_and_ends_of
     diagnoses_of_table(usable_table(begun), QUILL)
     assert spans[1] == pytest.approx(SAMPLES - BEGINS, abs=120)
     assert spans == sorted(spans, reverse=True) and spans[-1] == 60.0 * api.SHORT_H
+
+
+def test_an_end_without_measured_y_is_not_diagnosed(knocked: Part, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where no probe was taken for hours: what the whole of the record shows counts."""
+    asked = list[float]()
+
+    def diagnose(base: ThermalModel, measured: list[Measurement], **_: object) -> DiagnosisResult:
+        asked.append(float(np.ptp(measured[0].table.t_s)) / 60.0)
+        return knocked.found
+
+    monkeypatch.setattr(api, "diagnose", diagnose)
+    y_um = np.where(np.arange(knocked.table.t_s.size) < KNOCKED - 100, knocked.table.columns["y_um"], np.nan)
+    table = dataclasses.replace(knocked.table, columns=knocked.table.columns | {"y_um": y_um})
+    part, whole = diagnoses_of_table(table, QUILL)
+    assert part is whole and asked == [float(np.ptp(table.t_s)) / 60.0]
