@@ -99,6 +99,8 @@ def test_other_parameters_are_adopted_and_the_model_before_both_stays_the_way_ba
             break
     first, second = [seq for seq, step, _ in decisions(steps) if step in ("shadow", "adopt")][:2]
     assert second - first >= 6 * 60 - 1
+    (text,) = [note.text for step in steps for note in step.events if note.data.get("step") == "adopt"]
+    assert "with input:coolant_degc, newer parameters of the present effects; last" in text
     beside = {one.model_sha256 for one in run(loop, source, 1)[0].candidates}
     assert beside == {sha256_of(QUILL), sha256_of(extended(1.0))}
     ended.append(one.seq)

@@ -205,7 +205,7 @@ class Loop:
 
     def _adopt(self, place: Place) -> list[Note]:
         notes = decide_exchange(self.state, "adopt", place, self.compared)
-        text = f"a better model is adopted: {_named(place)}; {described(place.verdict)}"
+        text = f"a better model is adopted: {self._what(place)}; {described(place.verdict)}"
         if self.state.level_um:
             text += f"; its level is shifted by {self.state.level_um:+.1f} µm, to that of measured Y"
         return [*notes, note_of(self.state, place, LoopAction.ADOPT, text)]
@@ -217,10 +217,15 @@ class Loop:
             beside = choice.beside(place, before)
             notes = withdraw(self.state, before, surpassed(place.effects, beside), why="surpassed", comparison=beside)
         place.is_proposed = True
-        text = f"a better model is proposed: {_named(place)}; {described(place.verdict)}"
+        text = f"a better model is proposed: {self._what(place)}; {described(place.verdict)}"
         if self.compared(place).level_um is None:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [*notes, note_of(self.state, place, LoopAction.PROPOSE, text)]
+
+    def _what(self, place: Place) -> str:
+        """Return what a candidate is, in words."""
+        is_known = same_effects(place.effects, self.state.effects)
+        return f"{_named(place)}{', newer parameters of the present effects' if is_known else ''}"
 
     def _go_back(self, place: Place) -> list[Note]:
         notes = decide_exchange(self.state, "back", place, self.compared)
