@@ -29,6 +29,7 @@ from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.advice import advice_blocks
+from compensator.report.figure import Edges
 from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import (
     Block,
@@ -119,17 +120,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     deployed = rest is not None and rest.deployed
     stands = deployed and rest is not None and rest.instead
     causes = {cause[0]: cause for effect in diagnosis.effects for cause in _causes(diagnosis, effect)}
-    below = tuple(
-        Figure(
-            title="",
-            x_label=time.label,
-            y_label=unit,
-            lines=(time.line(label, values),),
-            edges=time.unnamed_runs,
-            height=1.7,
-        )
-        for label, unit, values in list(causes.values())[:CAUSES]
-    )
+    below = _panels(time, list(causes.values())[:CAUSES], edges=time.unnamed_runs, height=1.7)
     one = len(diagnosis.effects) == 1
     words = name(diagnosis.effects[0]) if one else f"the {len(diagnosis.effects)} effects found"
     refitted = bool(diagnosis.paths_um.any())
@@ -198,17 +189,7 @@ def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Sectio
 def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Figure:
     """Show the residual without the effect, the effect over it, and below it what it acts by."""
     causes = _causes(diagnosis, effect)
-    below = tuple(
-        Figure(
-            title="",
-            x_label=time.label,
-            y_label=unit,
-            lines=(time.line(label, values),),
-            edges=time.unnamed,
-            height=1.9,
-        )
-        for label, unit, values in causes
-    )
+    below = _panels(time, causes, edges=time.unnamed, height=1.9)
     rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
     note = f"Residual in the data that were searched, without every other effect.{rest}"
     return Figure(
@@ -228,6 +209,23 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
         edges=time.edges,
         below=below,
         note=f"{note} {'' if causes else 'No channel shows its cause.'}{time.note}".strip(),
+    )
+
+
+def _panels(
+    time: TimeAxis, causes: Sequence[tuple[str, str, Vector]], *, edges: tuple[Edges, ...], height: float
+) -> tuple[Figure, ...]:
+    """Return a panel below a picture for each cause (`_causes`)."""
+    return tuple(
+        Figure(
+            title="",
+            x_label=time.label,
+            y_label=unit,
+            lines=(time.line(label, values),),
+            edges=edges,
+            height=height,
+        )
+        for label, unit, values in causes
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import Self
 
 import numpy as np
@@ -13,6 +12,7 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.outcome import FOLDS, Diagnosis
 from compensator.diagnose.summary import name
 from compensator.report.figure import Bar, Edges, Figure, Line
+from compensator.report.local_time import shown, zone_at
 
 #: A gap between measured values is drawn as one if it is longer than this many usual intervals between them.
 _GAP = 3.0
@@ -131,7 +131,7 @@ class TimeAxis:
         label = "time, h"
         if since_utc_s is not None and not starts.size:
             first_s = since_utc_s + float(diagnosis.evidence.runs[0].t_s[0])
-            label += f" after {datetime.fromtimestamp(first_s, UTC):%Y-%m-%d %H:%M} UTC"
+            label += f" after {shown(first_s)} {zone_at(first_s)}"
         return cls(
             label=label,
             hours=np.asarray(hours),

@@ -77,6 +77,12 @@ def heat_w(samples: int) -> Vector:
     return np.asarray(np.where((t // 60) % 3 == 1, 80.0, 0.0) * (0.5 + 0.5 * ((t // 180) % 2)))
 
 
+def grown(change: float) -> Callable[[int], float]:
+    """What a gain of the DTF adds to Y of `machine`, µm; in four days at most."""
+    y_um = QUILL.dtf.sampled.response(heat_w(4 * DAY))
+    return lambda i: change * float(y_um[i])
+
+
 def machine(
     samples: int,
     acts: Callable[[int], float] = lambda i: 1.0,
@@ -133,6 +139,11 @@ def decisions(steps: Sequence[LoopStep]) -> list[tuple[int, str, str]]:
     """Return each decision: number of the sample, step and reason."""
     notes: list[tuple[int, Note]] = [(step.outcome.sample.seq, note) for step in steps for note in step.events]
     return [(seq, note.data["step"], note.data.get("why", "")) for seq, note in notes if note.kind == "loop"]
+
+
+def about(notes: Sequence[Note]) -> list[tuple[str, str]]:
+    """Return step and reason of decisions."""
+    return [(note.data["step"], note.data.get("why", "")) for note in notes]
 
 
 def crept(i: int) -> float:

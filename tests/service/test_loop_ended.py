@@ -21,20 +21,21 @@ from compensator.model.model_writer import dump_model
 from compensator.recording.reading import messages, recordings
 from compensator.service.loop.avoided import avoid
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.run import LoopRun, LoopStep
+from compensator.service.loop.run import LoopRun
 from compensator.service.loop.schedule import begin_if_due
 from compensator.service.loop.state import LoopState, Place, Role
 from compensator.service.loop.weighing import failed, weigh, without_effect
 from compensator.service.transfer.model_store import sha256_of
-from tests.service.living import MACHINE
+from tests.service.living import MACHINE, largest_step
 from tests.service.looping import (
     DAY,
     QUILL,
     Night,
+    about,
     decisions,
     errors,
     extended,
-    heat_w,
+    grown,
     machine,
     run,
     settings,
@@ -44,7 +45,6 @@ from tests.service.looping import (
 )
 from tests.service.test_loop_run import CHECKED
 from tests.service.test_loop_service import Looping, checked
-from tests.service.test_loop_several import about
 from tests.service.test_loop_weighing import remainder
 from tests.service.test_restart import QUILL as QUILL_FILE
 
@@ -57,11 +57,9 @@ NIGHTLY = {"policy": "adopt", "every_h": 24, "shadow_h": 6.0}
 
 def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() -> None:
     """The coolant stops to act a day after the adoption; the gain stays. No diagnosis finds it."""
-    assert QUILL.dtf is not None
-    y_um = QUILL.dtf.sampled.response(heat_w(4 * DAY))
     ends, night = 2 * DAY, Night(shown(BOTH))
     loop = LoopRun(settings(loop=NIGHTLY, **CHECKED), QUILL_FILE, night)
-    source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: 0.2 * float(y_um[i]))
+    source = machine(4 * DAY, lambda i: float(i < ends), more=grown(0.2))
     steps = run(loop, source)
     (back,) = [seq for seq, step, _ in decisions(steps) if step == "back"]
     assert loop.effects == ("gain:DTF",) and ends < back < ends + DAY // 2
@@ -73,7 +71,7 @@ def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() 
     assert {data["without"] for data in found if data.get("without")} <= set(EFFECTS)
     left = errors(steps[back + 60 :])
     assert np.std(left) < 0.5 * np.std(errors(steps[ends:back]))
-    assert _jumps(steps) <= 8.0 + 1e-9
+    assert largest_step([step.outcome for step in steps]) <= 8.0 + 1e-9
 
 
 @pytest.mark.parametrize(("policy", "step"), [("adopt", "back"), ("propose", "propose")])
@@ -81,11 +79,10 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
     policy: str, step: str
 ) -> None:
     """It does not know its level: measured Y was shifted before. The present level stays."""
-    assert QUILL.dtf is not None
-    y_um = QUILL.dtf.sampled.response(heat_w(4 * DAY))
+    gain = grown(0.2)
     ends, night = 2 * DAY, Night(shown(BOTH))
     loop = LoopRun(settings(loop=NIGHTLY | {"policy": policy, "every_h": 12}), QUILL_FILE, night)
-    source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: 0.2 * float(y_um[i]) + 8.0 * (i > 300))
+    source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: gain(i) + 8.0 * (i > 300))
     steps = run(loop, source, 1)
     while len(loop.effects) < 2:
         steps += run(loop, source, 1)
@@ -97,11 +94,6 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
     assert {one for _, one, _ in decisions(steps)} & {"adopt", "back", "propose"} == {step}
     if step == "back":
         assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 2 :])) < 1.0
-
-
-def _jumps(steps: list[LoopStep]) -> float:
-    offsets = np.array([step.outcome.offset.y_offset_um for step in steps[1:]])
-    return float(np.max(np.abs(np.diff(offsets))))
 
 
 def misfit(*places: Place, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:

@@ -13,7 +13,7 @@ import pytest
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, Note
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.recording.reading import messages, recordings
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
@@ -28,10 +28,11 @@ from tests.service.looping import (
     DAY,
     QUILL,
     Night,
+    about,
     crept,
     decisions,
     extended,
-    heat_w,
+    grown,
     machine,
     run,
     settings,
@@ -55,10 +56,6 @@ NOW_NS = 100 * HOUR_NS
 DAY_NS = 24 * HOUR_NS
 
 
-def about(notes: list[Note]) -> list[tuple[str, str]]:
-    return [(note.data["step"], note.data.get("why", "")) for note in notes]
-
-
 def decided(steps: list[LoopStep]) -> list[tuple[str, str]]:
     """Return what was decided, without the diagnoses that begin."""
     return [(step, why) for _, step, why in decisions(steps) if step != "diagnose"]
@@ -76,9 +73,8 @@ def decisions_of(path: Path) -> list[tuple[str, str]]:
 
 def stronger_dtf(change: float, acts: Callable[[int], bool]) -> Callable[[int], float]:
     """What a gain of the DTF adds to Y, beside a mount that creeps so that no level is known, µm."""
-    assert QUILL.dtf is not None
-    y_um = QUILL.dtf.sampled.response(heat_w(SAMPLES))
-    return lambda i: crept(i) + change * float(y_um[i]) * acts(i)
+    gain = grown(change)
+    return lambda i: crept(i) + gain(i) * acts(i)
 
 
 def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> Place:

@@ -13,7 +13,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.ending import end_diagnosis
-from compensator.service.loop.state import LoopState, Running, same_effects, without
+from compensator.service.loop.state import LoopState, Running, same_effects
 
 
 def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
@@ -62,7 +62,7 @@ def _may_have_ended(state: LoopState, now_ns: int) -> str:
     """Return the next effect without which the present model is to be compared, and is not yet; empty without one."""
     while state.to_leave_out:
         effect, *state.to_leave_out = state.to_leave_out
-        others = without(state.effects, effect)
+        others = [one for one in state.effects if one != effect]
         is_compared = any(same_effects(place.effects, others) for place in state.taken)
         if not is_compared and not is_avoided(state, others, now_ns):
             return effect

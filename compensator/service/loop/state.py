@@ -32,11 +32,6 @@ def same_effects(a: Sequence[str], b: Sequence[str]) -> bool:
     return sorted(a) == sorted(b)
 
 
-def without(effects: Sequence[str], effect: str) -> list[str]:
-    """Return effects without one of them."""
-    return [one for one in effects if one != effect]
-
-
 def is_fewer(effects: Sequence[str], of: Sequence[str]) -> bool:
     """Return whether some effects are a part of others, and not all of them.
 
