@@ -5,8 +5,8 @@ a step in that input. A fault of the probe is itself a ramp or step. A wrong gai
 scale, appears as a fraction of the prediction. Size and onset of every shape are fitted and the likelihoods compared;
 every fault whose likelihood is at least 1/20 of the best is a suspect.
 
-Model errors are correlated in time, so residual and shapes first pass the same first-order whitening filter. The loops
-have a fixed order, so that an audit finds the same suspects on another processor.
+Model errors are correlated in time, so residual and shapes first pass the same first-order whitening filter. Sums go
+block by block, for all shapes and onsets at once, so that an audit finds the same suspects on another processor.
 
 Source: Basseville and Nikiforov, Detection of Abrupt Changes (1993), chapter 7 (generalised likelihood ratio).
 """
@@ -19,6 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 
@@ -109,13 +112,13 @@ class FaultIsolation:
         """
         z = [block.residual_um / block.std_um for block in blocks]
         whitened = _whitened(z, self._keep)
+        stds = np.array([block.std_um for block in blocks])
+        sizes, gains = _fitted(whitened, self._moved[: len(blocks), : len(blocks) - 1] / stds[:, None, None], self._keep)
         best: dict[str, tuple[float, float, _Shape, int]] = {}
-        for begin in range(len(blocks) - 1):
-            for shape in self._shapes:
-                v = [value / block.std_um for value, block in zip(shape.values, blocks[begin:], strict=False)]
-                size, gain = _fitted(whitened, v, begin, self._keep)
+        for begin, row in enumerate(gains.tolist()):
+            for i, (shape, gain) in enumerate(zip(self._shapes, row, strict=True)):
                 if shape.suspect not in best or gain > best[shape.suspect][0]:
-                    best[shape.suspect] = gain, size, shape, begin
+                    best[shape.suspect] = gain, float(sizes[begin, i]), shape, begin
         fits = [
             FaultFit(shape.suspect, f"{shape.what} by {size:+.2g} {shape.unit}", len(blocks) - begin, gain)
             for gain, size, shape, begin in best.values()
@@ -128,8 +131,8 @@ class FaultIsolation:
         return ranked, count > 0 and left > MISFIT * count
 
     def _as_prediction(self, blocks: Sequence[ResidualBlock], whitened: Sequence[_Whitened]) -> FaultFit:
-        v = [block.predicted_um / block.std_um for block in blocks]
-        size, gain = _fitted(whitened, v, 0, self._keep)
+        v = np.array([block.predicted_um / block.std_um for block in blocks])
+        size, gain = (float(found) for found in _fitted(whitened, v, self._keep))
         words = f"measured Y is {1.0 + size:.2f} times the prediction"
         return FaultFit("model", words, len(blocks), gain)
 
@@ -145,6 +148,15 @@ class FaultIsolation:
         made.append(_Shape("y_um", "µm/h", "measured Y drifts", hours))
         made.append(_Shape("y_um", "µm", "measured Y jumped", (1.0,) * self._window))
         return tuple(made)
+
+    @cached_property
+    def _moved(self) -> Matrix:
+        """The shapes by block, for each block that they may begin in: zero before it, shape (blocks, begins, shapes)."""
+        found = np.zeros((self._window, self._window, len(self._shapes)))
+        for i, shape in enumerate(self._shapes):
+            for begin in range(self._window):
+                found[begin:, begin, i] = shape.values[: self._window - begin]
+        return found
 
     def _response(self, t_q_k: float, at_k: float, *, ramp: bool) -> tuple[float, ...]:
         """Return the effect of a sensor fault on the residual, µm by block: minus its effect on the prediction."""
@@ -174,20 +186,17 @@ def _whitened(z: Sequence[float], keep: float) -> list[_Whitened]:
     return found
 
 
-def _fitted(z: Sequence[_Whitened], v: Sequence[float], begin: int, keep: float) -> tuple[float, float]:
-    """Return size and log likelihood gain of a shape that is zero before a block; missing blocks are left out."""
-    cross = square = v_before = 0.0
+def _fitted(z: Sequence[_Whitened], v: Vector, keep: float) -> tuple[Vector, Vector]:
+    """Return size and log likelihood gain of shapes, by block along the first axis; missing blocks are left out."""
+    cross, square, before = (np.zeros(v.shape[1:]) for _ in range(3))
     for i, weighted, weight in z:
-        if i < begin:
-            continue
-        vi = v[i - begin]
-        ev = vi - keep * v_before
+        ev = v[i] - keep * before
         cross += weighted * ev
         square += weight * ev * ev
-        v_before = vi
-    if not square > 0.0:
-        return 0.0, 0.0
-    return cross / square, 0.5 * cross * cross / square
+        before = v[i]
+    explains = square > 0.0
+    divided = np.where(explains, square, 1.0)
+    return np.where(explains, cross / divided, 0.0), np.where(explains, 0.5 * cross * cross / divided, 0.0)
 
 
 def _energy(z: Sequence[float], keep: float) -> tuple[float, int]:
