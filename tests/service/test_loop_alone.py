@@ -282,16 +282,15 @@ def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> 
     assert loop.state.misfit_min == 0.0
 
 
-def test_what_was_shown_while_the_clock_was_ahead_counts_no_longer_and_delays_nothing_else() -> None:
-    """The first two hours by a clock that is 100 h ahead; newer parameters have taken over meanwhile."""
+def test_what_was_shown_while_the_clock_was_ahead_counts_as_if_it_had_been_right() -> None:
+    """The first two hours by a clock that is 100 h ahead: six hours in all are measured after four more."""
     loop = loop_of(place("a"), every_h=168)
     list(decided(loop, 2, never, {"a": never}, ahead=lambda _: 6000))
     state, (found,) = loop.state, loop.state.found
-    future_ns = BEGIN_NS + 100 * HOUR_NS
-    found.comparison.model_ns = found.level_utc_ns = future_ns
-    avoid(state, ["gain:TDTF"], future_ns, 168.0)
+    avoid(state, ["gain:TDTF"], BEGIN_NS + 102 * HOUR_NS, 168.0)
     assert found.comparison.blocks and state.error.blocks
-    assert list(decided(loop, 24, never, {"a": never}))[-1] == Decided(6.0, "adopt", "")
-    now_ns = BEGIN_NS + 6 * HOUR_NS
+    assert list(decided(loop, 24, never, {"a": never}))[-1] == Decided(4.0, "adopt", "")
+    now_ns = BEGIN_NS + 4 * HOUR_NS
     assert max(number * BLOCK_NS for number, _ in state.error.blocks) <= now_ns
-    assert not is_avoided(state, ["gain:TDTF"], now_ns + 169 * HOUR_NS)
+    assert is_avoided(state, ["gain:TDTF"], now_ns + 163 * HOUR_NS)
+    assert not is_avoided(state, ["gain:TDTF"], now_ns + 165 * HOUR_NS)

@@ -13,7 +13,7 @@ from compensator.config import Loop
 from compensator.errors import CompensatorError, ServiceError
 from compensator.messages import Sample
 from compensator.service.compensation import Compensation
-from compensator.service.loop.avoided import avoid_after_back, is_avoided
+from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.core import LOOP_STATE, ModelLoop, shadow_files
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.schedule import begin_if_due, pass_planned
@@ -56,6 +56,37 @@ def test_a_weekend_is_no_time_in_which_a_candidate_was_compared() -> None:
     assert all(seq >= FIRST + 300 + 3600 + 12 * 60 for seq in adopted)
 
 
+@pytest.mark.parametrize("days", [-30, 30])
+def test_a_clock_that_is_wrong_by_a_month_ends_nothing_that_waits(days: int) -> None:
+    """A flat battery: the service starts with a wrong time, which is set right some minutes later."""
+    loop = LoopRun(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
+    source = machine(FIRST + 1500)
+    run(loop, source, FIRST + 1200)
+    now_ns = run(loop, source, 1)[0].outcome.sample.time_utc_ns
+    avoid(loop._core.state, ["gain:DTF"], now_ns, 168.0)
+    assert loop.phase == "proposed"
+    loop.pause(None if days < 0 else days * 1440 - 1)
+    steps = run(loop, (moved(one, 24.0 * days) for one in source), 6)
+    steps += run(loop, source, 200)
+    assert loop.phase == "proposed" and decisions(steps) == []
+    now_ns = steps[-1].outcome.sample.time_utc_ns
+    assert is_avoided(loop._core.state, ["gain:DTF"], now_ns + 164 * HOUR_NS)
+    assert not is_avoided(loop._core.state, ["gain:DTF"], now_ns + 166 * HOUR_NS)
+
+
+def test_after_a_weekend_nothing_is_diagnosed_before_there_is_a_record() -> None:
+    """The planned times that have passed meanwhile count as done, and so does what the model has erred by."""
+    loop = LoopRun(settings(loop={"misfit_h": 2.0}), QUILL, Night(shown(None, "adequate")))
+    source = machine(FIRST + 120 + 3600 + 1000)
+    run(loop, source, FIRST + 120)
+    loop._core.state.misfit_min = 600.0
+    loop.pause(3600)
+    for _ in zip(range(3600), source, strict=False):
+        pass
+    begun = [seq for seq, step, _ in decisions(run(loop, source)) if step == "diagnose"]
+    assert begun and begun[0] >= FIRST + 120 + 3600 + 120
+
+
 def test_a_person_who_agrees_twice_or_dismisses_then_gets_one_adoption() -> None:
     loop = LoopRun(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
     source = machine(FIRST + 1500)
@@ -86,7 +117,7 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
         whole | {model: extended(2.0)},
         whole | {state: whole[state][:-20]},
         whole | {LOOP_STATE: whole[LOOP_STATE][:-20]},
-        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":4', b'{"schema":1')},
+        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":5', b'{"schema":1')},
     ):
         with pytest.raises(CompensatorError):
             ModelLoop(settings(), present.model, damaged)

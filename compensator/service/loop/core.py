@@ -138,6 +138,7 @@ class ModelLoop:
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured, as the present compensation does."""
+        self.loop.pause(samples)
         for shadow in self.shadows.values():
             shadow.compensation.pause(samples)
 

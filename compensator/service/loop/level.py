@@ -68,13 +68,10 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
         if np.isfinite(residual_um) and not is_disturbed(outcome.offset.reasons):
             self.count, self.sum_um = self.count + 1, self.sum_um + residual_um
 
-    def forget_after(self, time_utc_ns: int) -> None:
-        """Forget what is later than a time, ns since 1970 UTC: the clock was ahead."""
-        last = time_utc_ns // BLOCK_NS
-        if self.number <= last:
-            return
-        self.blocks = [block for block in self.blocks if block[0] <= last]
-        self.number, self.count, self.sum_um = 0, 0, 0.0
+    def move_clock(self, by_ns: int) -> None:
+        """Move all times, as the clock was set."""
+        by = round(by_ns / BLOCK_NS)
+        self.blocks, self.number = [(number + by, mean) for number, mean in self.blocks], self.number + by
 
     def clear(self) -> None:
         """Begin anew: at a zero, or with another model."""

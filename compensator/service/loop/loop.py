@@ -89,6 +89,10 @@ class Loop:
         has_drifted = state.y_drifted_ns > 0
         return Compared(place, self._settings, self._period_s, state.error, alike=max(alike, 1), y_drifted=has_drifted)
 
+    def pause(self, samples: int | None) -> None:
+        """Account for samples that were not measured; None: nobody knows how many, and for how long does not count."""
+        self.state.missing += samples or 0
+
     # ------------------------------------------------------------------ one sample
 
     def step(self, present: Outcome, others: Mapping[str, Outcome]) -> list[Note]:
@@ -108,12 +112,12 @@ class Loop:
         """
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
         minutes, contradicted = self._period_s / 60.0, is_contradicted(reasons)
-        state.forget_future(now_ns, avoided_h=self._settings.watch_h)
+        record_ns = round(self._settings.record_h * HOUR_NS)
+        state.follow_clock(now_ns, round(self._period_s * NS), record_ns)
         all_suspect = bool(others) and all_suspect_a_sensor([present, *others.values()])
         suspected = contradicted or (all_suspect and not any(is_constant(place.error.blocks) for place in state.taken))
         state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
-        record_ns = round(self._settings.record_h * HOUR_NS)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
         if errs(state, self._settings):
             # What was compared before says nothing of an effect that has ended since.

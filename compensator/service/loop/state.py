@@ -9,15 +9,14 @@ from typing import Literal
 
 import msgspec
 
-from compensator.clock import HOUR_NS
 from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.messages import UNREADABLE, check_numbers
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.transfer.comparison import ComparisonState
+from compensator.service.transfer.comparison import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 4
+STATE_SCHEMA = 5
 
 #: A candidate may be adopted; to a model from before, or with fewer effects, the service goes back.
 Role = Literal["candidate", "before"]
@@ -148,6 +147,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     ----------
     schema : int
         `STATE_SCHEMA`.
+    time_utc_ns, missing : int
+        Time of the last sample, ns since 1970 UTC; 0 before. And how many have been missed since then.
     exchange : {"", "adopt", "back"}
         An exchange that was decided and happens before the next sample.
     incoming : str
@@ -193,6 +194,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """
 
     schema: int = STATE_SCHEMA
+    time_utc_ns: int = 0
+    missing: int = 0
     exchange: Exchange = ""
     incoming: str = ""
     level_um: float = 0.0
@@ -226,33 +229,51 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         """Return the model in shadow with a hash."""
         return next((place for place in self.taken if place.sha256 == sha256), None)
 
-    def forget_future(self, now_ns: int, *, avoided_h: float) -> None:
-        """Let nothing have happened after now: the clock was ahead, and was set back.
+    def follow_clock(self, now_ns: int, period_ns: int, record_ns: int) -> None:
+        """Go on at the time of a sample: where the clock was set since the last one, every time moves with it.
+
+        So what has lasted for some hours has lasted as long after it. Of what waits for a person, or may be gone back
+        from, the time off does not count either. Where no more than a moment of the record is left to be diagnosed,
+        the next planned time is waited for.
 
         Parameters
         ----------
-        now_ns : int
-            Now, ns since 1970 UTC.
-        avoided_h : float
-            For how long effects are avoided at most, h.
+        now_ns, period_ns : int
+            Time of the sample, ns since 1970 UTC, and length of one, ns.
+        record_ns : int
+            Length of the record that is diagnosed, ns.
         """
-        self.diagnosed_utc_ns = min(self.diagnosed_utc_ns, now_ns)
-        self.left_out_utc_ns = min(self.left_out_utc_ns, now_ns)
-        self.adopted_utc_ns = min(self.adopted_utc_ns, now_ns)
-        self.zero_utc_ns = min(self.zero_utc_ns, now_ns)
-        self.y_drifted_ns = min(self.y_drifted_ns, now_ns)
-        self.uncompared_ns = min(self.uncompared_ns, now_ns)
-        self.probes_shown = [one for one in self.probes_shown if one[0] <= now_ns]
-        longest_ns = now_ns + round(avoided_h * HOUR_NS)
-        self.avoided = [
-            msgspec.structs.replace(one, until_utc_ns=min(one.until_utc_ns, longest_ns)) for one in self.avoided
-        ]
-        self.error.forget_after(now_ns)
+        last_ns, off_ns = self.time_utc_ns, self.missing * period_ns
+        self.time_utc_ns, self.missing = now_ns, 0
+        set_ns = now_ns - last_ns - off_ns - period_ns if last_ns else 0
+        if abs(set_ns) >= period_ns:
+            self._move_clock(set_ns)
+        else:
+            set_ns = 0
+        self._move_terms(set_ns + off_ns)
+        if max(abs(set_ns), off_ns) >= record_ns:
+            self.planned_utc_ns, self.usable_min, self.misfit_min = 0, 0.0, 0.0
+
+    def _move_clock(self, by_ns: int) -> None:
+        self.diagnosed_utc_ns = moved(self.diagnosed_utc_ns, by_ns)
+        self.left_out_utc_ns = moved(self.left_out_utc_ns, by_ns)
+        self.zero_utc_ns = moved(self.zero_utc_ns, by_ns)
+        self.y_drifted_ns = moved(self.y_drifted_ns, by_ns)
+        self.uncompared_ns = moved(self.uncompared_ns, by_ns)
+        self.probes_shown = [(at_ns + by_ns, shown) for at_ns, shown in self.probes_shown]
+        self.error.move_clock(by_ns)
         for place in self.taken:
-            place.since_utc_ns = min(place.since_utc_ns, now_ns)
-            place.level_utc_ns = min(place.level_utc_ns, now_ns)
-            place.comparison.forget_after(now_ns)
-            place.error.forget_after(now_ns)
+            place.level_utc_ns = moved(place.level_utc_ns, by_ns)
+            place.comparison.move_clock(by_ns)
+            place.error.move_clock(by_ns)
+
+    def _move_terms(self, by_ns: int) -> None:
+        self.adopted_utc_ns = moved(self.adopted_utc_ns, by_ns)
+        for place in self.taken:
+            place.since_utc_ns = moved(place.since_utc_ns, by_ns)
+        self.avoided = [
+            msgspec.structs.replace(one, until_utc_ns=moved(one.until_utc_ns, by_ns)) for one in self.avoided
+        ]
 
     def remove(self, place: Place) -> None:
         """Let a model go."""

@@ -37,6 +37,11 @@ _MEASURED = 0.5
 BLOCK_NS = round(BLOCK_MIN * 60 * NS)
 
 
+def moved(time_utc_ns: int, by_ns: int) -> int:
+    """Return a time after the clock was set, ns since 1970 UTC; 0, which is none, stays."""
+    return max(time_utc_ns + by_ns, 1) if time_utc_ns else 0
+
+
 class Block(msgspec.Struct, frozen=True, array_like=True):
     """A block of samples about one zero.
 
@@ -110,16 +115,15 @@ class ComparisonState(msgspec.Struct, kw_only=True):
     y_um: float | None = None
     model_ns: int = 0
 
-    def forget_after(self, time_utc_ns: int) -> None:
-        """Forget what is later than a time, ns since 1970 UTC: the clock was ahead."""
-        if self.last_ns <= time_utc_ns:
-            return
-        last = time_utc_ns // BLOCK_NS
-        self.blocks = [block for block in self.blocks if block.number <= last]
-        self.rows = self.rows if self.number <= last else []
-        self.probes = [probe for probe in self.probes if probe.time_utc_ns <= time_utc_ns]
-        self.first_ns, self.last_ns = min(self.first_ns, time_utc_ns), time_utc_ns
-        self.model_ns = min(self.model_ns, time_utc_ns)
+    def move_clock(self, by_ns: int) -> None:
+        """Move all times, as the clock was set."""
+        by = round(by_ns / BLOCK_NS)
+        self.number += by
+        self.blocks = [msgspec.structs.replace(block, number=block.number + by) for block in self.blocks]
+        self.probes = [msgspec.structs.replace(one, time_utc_ns=one.time_utc_ns + by_ns) for one in self.probes]
+        self.first_ns, self.last_ns, self.model_ns = (
+            moved(at, by_ns) for at in (self.first_ns, self.last_ns, self.model_ns)
+        )
 
 
 class Comparison:
