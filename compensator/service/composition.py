@@ -47,7 +47,7 @@ async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | Driv
 
 def loop_parts(setup: Setup, resumed: Resumed, diagnose: Diagnose | None = None) -> LoopParts | None:
     """Return the parts of the loop, which continues from the last recording; None without `[loop]`."""
-    core = resume_loop(setup.loaded, resumed)
+    core = resume_loop(setup.loaded, resumed, setup.store)
     if core is None:
         return None
     made_by = diagnose or DiagnosisProcess(setup.config, setup.recordings, setup.store.folder / "diagnoses")

@@ -107,7 +107,7 @@ class Machine:
             {"config.toml": self.config_bytes, "model.toml": data},
             topics=topics_of(probes=self.config.probe is not None, loop=self.config.loop is not None),
         )
-        core = resume_loop(loaded, resumed)
+        core = resume_loop(loaded, resumed, self.store)
         loop = None
         if core is not None:
             loop = LoopParts(core=core, model=data, store=self.store, diagnose=self.diagnose)

@@ -277,7 +277,7 @@ def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> 
     loop = loop_of()
     diagnosed(loop, -6.0, 5.0)
     assert loop.state.misfit_min > 0.0 and decode_loop(msgspec.json.encode(loop.state)) == loop.state
-    loop.model_changed(["gain:DTF"], BEGIN_NS + 1440 * 60 * NS)
+    loop.model_changed(["gain:DTF"], calibrated=[], now_ns=BEGIN_NS + 1440 * 60 * NS)
     loop.step(outcome(1441, math.nan, math.nan, ()), {})
     assert loop.state.misfit_min == 0.0
 

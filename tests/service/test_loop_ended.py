@@ -154,11 +154,11 @@ def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
     assert begun(misfit(base_effects=EFFECTS[:1])) == ("misfit", "gain:DTF")
     # The loop had adopted it, and then a person takes it for the calibrated model.
     loop = Loop(LoopSettings(), 60.0, EFFECTS, misfit())
-    loop.model_changed(EFFECTS, NOW_NS)
+    loop.model_changed(EFFECTS, NOW_NS, calibrated=EFFECTS)
     assert begun(loop.state) == ("misfit", "")
     # Back to what the loop had adopted before, these are still its own.
     loop = Loop(LoopSettings(), 60.0, [*EFFECTS, "delay:DTF"], misfit())
-    loop.model_changed(EFFECTS, NOW_NS, back=True)
+    loop.model_changed(EFFECTS, NOW_NS, calibrated=[], back=True)
     assert begun(loop.state) == ("misfit", EFFECTS[0])
 
 

@@ -26,6 +26,7 @@ from compensator.recording.reading import RawRecord, groups_of, messages, record
 from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.state import LoopState, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
@@ -49,6 +50,9 @@ shadow_h = 6.0
 
 #: The service starts so long before the night's diagnosis, samples; none of these needs a whole day before it.
 EVENING = 60
+
+
+EFFECT = ["input:coolant_degc"]
 
 
 class Looping(Machine):
@@ -273,7 +277,31 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "by_hand")]
     assert machine.store.calibrated() == other
     assert "candidate.toml" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
+    assert last_state(machine).base_effects == EFFECT
+    machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "back")
+    await machine.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(QUILL))
+    await machine.run(5)
+    assert last_state(machine).effects == last_state(machine).base_effects == []
     checked(machine)
+
+
+def last_state(machine: Looping) -> LoopState:
+    """Return the state of the loop with which the last recording begins."""
+    return decode_loop(opening_of(recordings(machine.recordings, MACHINE)[-1])["loop.json"])
+
+
+async def test_what_the_loop_has_added_is_its_own_whatever_is_edited_in_the_configuration(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await machine.run(5)
+    assert (last_state(machine).effects, last_state(machine).base_effects) == (EFFECT, [])
+    machine.use(machine.config_bytes + b"# a remark\n")
+    await machine.run(5)
+    assert (last_state(machine).effects, last_state(machine).base_effects) == (EFFECT, [])
+    for path in recordings(machine.recordings, MACHINE):
+        path.unlink()  # and whatever is lost
+    await machine.run(5)
+    assert (last_state(machine).effects, last_state(machine).base_effects) == (EFFECT, [])
 
 
 async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path) -> None:

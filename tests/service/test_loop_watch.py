@@ -277,7 +277,7 @@ def begun() -> tuple[Loop, int]:
         (lambda loop, now_ns: gone_back(loop, now_ns), "replaced"),
         (lambda loop, now_ns: loop.restarted(), "interrupted"),
         (lambda loop, now_ns: loop.give_up_one("", "failed", "no memory"), "failed"),
-        (lambda loop, now_ns: loop.model_changed([], now_ns), "by_hand"),
+        (lambda loop, now_ns: loop.model_changed([], now_ns, calibrated=[]), "by_hand"),
     ],
 )
 def test_what_was_said_to_begin_and_does_not_ends_with_an_event(ends: Any, why: str) -> None:

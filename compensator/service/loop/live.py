@@ -27,7 +27,7 @@ from compensator.service.loop.found import Found, diagnosed
 from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.status import loop_status
-from compensator.service.loop.storing import Storing
+from compensator.service.loop.storing import Storing, calibrated_effects
 from compensator.service.loop.weighing import effect_names
 from compensator.service.loop.words import named
 from compensator.service.transfer.comparison import changed
@@ -246,7 +246,9 @@ class LiveLoop:
         def begin_anew(core: ModelLoop) -> None:
             self._cancel()
             core.present = present.model
-            self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
+            effects, now_ns = effect_names(present.model), present.status.time_utc_ns
+            calibrated = calibrated_effects(self._config, self._store, effects)
+            self._note(core.loop.model_changed(effects, now_ns, calibrated=calibrated, back=back))
             core.drop_ended()
 
         self._guarded(begin_anew, None)

@@ -370,14 +370,24 @@ class Loop:
             )
         return meant[0]
 
-    def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
-        """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
+    def model_changed(
+        self, effects: Sequence[str], now_ns: int, *, calibrated: Sequence[str], back: bool = False
+    ) -> list[Note]:
+        """Begin anew: an operator has changed the model; a diagnosis under way is of no use.
+
+        Parameters
+        ----------
+        effects, calibrated : sequence of str
+            Effects of the present model, and of the calibrated one.
+        now_ns : int
+            Time, ns since 1970 UTC.
+        back : bool
+            Whether the operator has gone back from the effects before.
+        """
         state = self.state
         if back:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
-        else:
-            state.base_effects = list(effects)
-        state.effects = list(effects)
+        state.effects, state.base_effects = list(effects), list(calibrated)
         state.forget_errors()
         notes = self.give_up("by_hand", "a person has changed the model or the configuration")
         state.forget_left_out()

@@ -8,6 +8,7 @@ ends; what was adopted and gone back from stays known.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +20,10 @@ from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, ModelLoop
 from compensator.service.loop.replaying import RecordedLoop, recorded_loop
+from compensator.service.loop.storing import calibrated_effects
 from compensator.service.loop.weighing import effect_names
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
+from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.restart import Resumed
 
 log = logging.getLogger("compensator")
@@ -36,7 +39,7 @@ class _Replayed:
     model: bytes
 
 
-def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
+def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ModelLoop | None:
     """Return the loop in its state at the end of the last recording, None without `[loop]`.
 
     After an interrupted exchange `resumed` gets the compensation that continues from the one before; events are added
@@ -45,7 +48,12 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     config = loaded.config
     if config.loop is None or not config.loop.is_on:
         return None
-    present = resumed.compensation
+    calibrated = calibrated_effects(config, store, effect_names(resumed.compensation.model))
+    return _continued(loaded, resumed, calibrated)
+
+
+def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]) -> ModelLoop:
+    config, present = loaded.config, resumed.compensation
     try:
         last = _replayed(config, loaded.resolve(config.recording.folder))
     except CompensatorError as error:
@@ -57,7 +65,9 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
         resumed.note(f"the loop starts again without its state: internal error: {type(error).__name__}: {error}")
         last = None
     if last is None:
-        return ModelLoop(config, present.model, {})
+        core = ModelLoop(config, present.model, {})
+        core.state.base_effects = list(calibrated)
+        return core
     core = last.loop.core
     if last.config == loaded.data:
         if last.compensation.model.sha256 == present.model.sha256:
@@ -66,7 +76,8 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
         if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
             resumed.notes += _complete(resumed, last)
             return core
-    resumed.notes += core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
+    effects, now_ns = effect_names(present.model), present.status.time_utc_ns
+    resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated)
     core.drop_ended()
     return ModelLoop(config, present.model, core.attachments())
 

@@ -113,7 +113,8 @@ class FaultIsolation:
         z = [block.residual_um / block.std_um for block in blocks]
         whitened = _whitened(z, self._keep)
         stds = np.array([block.std_um for block in blocks])
-        sizes, gains = _fitted(whitened, self._moved[: len(blocks), : len(blocks) - 1] / stds[:, None, None], self._keep)
+        moved = self._moved[: len(blocks), : len(blocks) - 1]
+        sizes, gains = _fitted(whitened, moved / stds[:, None, None], self._keep)
         best: dict[str, tuple[float, float, _Shape, int]] = {}
         for begin, row in enumerate(gains.tolist()):
             for i, (shape, gain) in enumerate(zip(self._shapes, row, strict=True)):
@@ -151,7 +152,7 @@ class FaultIsolation:
 
     @cached_property
     def _moved(self) -> Matrix:
-        """The shapes by block, for each block that they may begin in: zero before it, shape (blocks, begins, shapes)."""
+        """The shapes by block, for each block that they may begin in, shape (blocks, begins, shapes)."""
         found = np.zeros((self._window, self._window, len(self._shapes)))
         for i, shape in enumerate(self._shapes):
             for begin in range(self._window):
