@@ -32,6 +32,10 @@ from compensator.recording.signature import Signer
 
 log = logging.getLogger("compensator")
 
+_DAY_NS = 86_400 * NS
+#: A clock that is this much later than the recording before, days, is believed once it has gone on for as long.
+CONFIRMED_DAYS = 7
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Retention:
@@ -145,9 +149,10 @@ class Finisher:
                 path, now_ns = self._jobs.popleft()
             error = self._compacted(path) if path is not None else None
             # Also if the disk is too full for the copy: the removal makes room for it.
-            if self._remove_oldest(now_ns) and path is not None and isinstance(error, OSError):
+            needs_room = path is None or isinstance(error, OSError)
+            if self._remove_oldest(now_ns, needs_room=needs_room) and path is not None and needs_room:
                 error = self._compacted(path)
-                self._remove_oldest(now_ns)
+                self._remove_oldest(now_ns, needs_room=error is not None)
             if error is not None and path is not None and path.exists():
                 text = f"{path.name}: could not be compacted and remains unchanged: {error}"
                 self.remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
@@ -181,23 +186,25 @@ class Finisher:
                 return place
         return 0
 
-    def _remove_oldest(self, now_ns: int) -> bool:
+    def _remove_oldest(self, now_ns: int, *, needs_room: bool) -> bool:
         """Remove files beyond the retention limit; return whether a file was removed.
 
         The newest two with a chain are kept: the one that is being written, and the finished one that the next start
-        needs.
+        needs. Unless the disk is full, no clock that is ahead makes files old (`confirmed_ns`).
         """
         limits = self._retention
         if limits.keep_days is None and limits.keep_mb is None:
             return False
         paths = recordings(self._folder, self._machine)
-        oldest_ns = -1 if limits.keep_days is None else now_ns - int(limits.keep_days * 86_400) * NS
+        began = {path: began_ns(path, self._machine) for path in paths}
+        today_ns = now_ns if needs_room else confirmed_ns(list(began.values()), now_ns)
+        oldest_ns = -1 if limits.keep_days is None else today_ns - int(limits.keep_days * _DAY_NS)
         removed = []
         try:
             sizes = {path: path.stat().st_size for path in paths}
             for path in paths[: self._first_needed(paths)]:
                 too_much = limits.keep_mb is not None and sum(sizes.values()) > limits.keep_mb * 1e6
-                if not too_much and began_ns(path, self._machine) >= oldest_ns:
+                if not too_much and began[path] >= oldest_ns:
                     break
                 path.unlink()
                 removed.append((path.name, sizes.pop(path)))
@@ -212,6 +219,32 @@ class Finisher:
             text = f"{len(names)} recording(s) removed by the retention limit, up to {names[-1]}"
             self.remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
         return bool(removed)
+
+
+def confirmed_ns(began: Sequence[int], now_ns: int) -> int:
+    """Return the time by which recordings are old: now, or of one a day after those that a jump of the clock follows.
+
+    Parameters
+    ----------
+    began : sequence of int
+        When each recording began, ns since 1970 UTC.
+    now_ns : int
+        Now, ns since 1970 UTC.
+
+    Examples
+    --------
+    >>> day = 86_400 * 10**9
+    >>> [confirmed_ns([1 * day, 2 * day, 900 * day], now * day) // day for now in (900, 906, 907)]
+    [3, 3, 907]
+    """
+    begins, limit_ns = sorted(began), CONFIRMED_DAYS * _DAY_NS
+    end_ns = now_ns
+    for before, after in zip(reversed(begins[:-1]), reversed(begins[1:]), strict=True):
+        if end_ns - after >= limit_ns:
+            break
+        if after - before >= limit_ns:
+            end_ns = before + _DAY_NS
+    return min(end_ns, now_ns)
 
 
 def compact(

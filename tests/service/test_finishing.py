@@ -267,6 +267,28 @@ def test_old_files_are_removed_and_the_audit_says_where_it_begins(tmp_path: Path
     assert "continues vmc-07_20260106T060000Z.mcap, which the retention limit removed" in " ".join(found.remarks)
 
 
+@pytest.mark.parametrize("ahead_days", [30, 1100])
+def test_a_clock_that_is_ahead_for_some_minutes_or_days_makes_no_recording_old(tmp_path: Path, ahead_days: int) -> None:
+    service = days(tmp_path, 6, keep_days=10.0)
+    for moved_days in (ahead_days, ahead_days + 1, ahead_days + 2, 6, 7):
+        service.start_ns = START_NS + moved_days * DAY_NS - service.seq * MINUTE_NS
+        service.run(5)
+        service.recorder._finisher.wait()
+    service.stop()
+    assert len(recordings(tmp_path, MACHINE)) == 11 and service.recorder.remarks() == []
+
+
+def test_after_a_holiday_recordings_are_old_once_a_week_has_confirmed_the_clock(tmp_path: Path) -> None:
+    service, left = days(tmp_path, 3, keep_days=10.0), []
+    for day in range(30, 40):
+        service.start_ns = START_NS + day * DAY_NS - service.seq * MINUTE_NS
+        service.run(5)
+        service.recorder._finisher.wait()
+        left.append(len(recordings(tmp_path, MACHINE)))
+    service.stop()
+    assert left == [4, 5, 6, 7, 8, 9, 10, 11, 9, 10]
+
+
 def test_the_size_of_all_files_is_limited_and_the_newest_stay(tmp_path: Path) -> None:
     service = days(tmp_path, 6, keep_mb=0.05)
     service.stop()
@@ -330,13 +352,13 @@ def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_
     service.run(5)
     service.recorder._finisher.wait()
     remarks = service.recorder.remarks()
-    assert [name for _, data in remarks for name in data.get("removed", [])] == [path.name for path in before[:-1]]
+    assert [name for _, data in remarks for name in data.get("removed", [])] == [path.name for path in before[:-2]]
     for text, data in remarks:
         service.note("recording", text, data)
     service.run(1).stop()
     found = audit(recordings(small_disk, MACHINE))
     assert found.clean, found.findings
-    assert f"continues {before[-2].name}, which the retention limit removed" in " ".join(found.remarks)
+    assert f"continues {before[-3].name}, which the retention limit removed" in " ".join(found.remarks)
 
 
 def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
