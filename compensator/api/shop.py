@@ -231,7 +231,9 @@ class _Summary:
             raise DataError(f"{self._named['folder']}: no samples in its recordings")
         needs = self._needs
         if self._proposed:
-            needs = f"decide on the proposal: compensator adopt --candidate, or dismiss{f'; {needs}' if needs else ''}"
+            one = self._proposed_sha256[:12]
+            answers = f"compensator adopt --candidate {one} --config FILE, or dismiss {one} --config FILE"
+            needs = f"decide on the proposal: {answers}{f'; {needs}' if needs else ''}"
         return MachineLoop(
             folder=self._named["folder"],
             machine=self._named["machine"],

@@ -28,11 +28,12 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the configuration or the model cannot be used, or the service refuses.
     """
-    if (arguments.model is None) == (not arguments.candidate):
+    if (arguments.model is None) == (arguments.candidate is None):
         raise UsageError("expected either MODEL, or --candidate for the model that the service proposes")
     setup = load(arguments.config)
-    if arguments.candidate:
-        return _decide(CommandName.ADOPT, {"candidate": True, "force": arguments.force}, setup, arguments)
+    if arguments.candidate is not None:
+        wanted = {"candidate": True, "force": arguments.force, "sha256": arguments.candidate}
+        return _decide(CommandName.ADOPT, wanted, setup, arguments)
     data = read_model_bytes(arguments.model)
     model = check_model(setup.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
@@ -77,7 +78,7 @@ def dismiss(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the configuration cannot be used, or the service is not reached or refuses.
     """
-    return _decide(CommandName.DISMISS, {}, load(arguments.config), arguments)
+    return _decide(CommandName.DISMISS, {"sha256": arguments.candidate}, load(arguments.config), arguments)
 
 
 def _decide(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> Answer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,13 @@ _READ, _READ_TEXT = Reads(), Reads(str)
 _TABLE, _PAGE_FILE, _FOLDER = Writes(".csv"), Writes(".html"), Writes("")
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
 _SCHEDULER = "run on this Dask scheduler, such as tcp://host:8786 (default: all cores of this computer)"
+
+
+def _hash(text: str) -> str:
+    """Read the beginning of a hash; empty: whichever there is."""
+    if re.fullmatch("([0-9a-f]{6,64})?", text) is None:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected the first 6 or more digits of a hash, such as 055e0d2a")
+    return text
 
 
 def _column(parser: argparse.ArgumentParser) -> None:
@@ -263,12 +271,15 @@ def report(parser: argparse.ArgumentParser) -> None:
 def adopt(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `adopt`."""
     parser.add_argument("model", type=_READ_TEXT, nargs="?", metavar="MODEL", help="a model file, or quill")
-    parser.add_argument("--candidate", action="store_true", help="adopt the model that the service proposes ([loop])")
+    words = "adopt the model that the service proposes ([loop]): only this one, by the first digits of its hash"
+    parser.add_argument("--candidate", type=_hash, nargs="?", const="", metavar="HASH", help=words)
     back(parser)
 
 
 def dismiss(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `dismiss`."""
+    words = "the first digits of its hash (default: the proposed one)"
+    parser.add_argument("candidate", type=_hash, nargs="?", default="", metavar="HASH", help=words)
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)

@@ -115,7 +115,7 @@ class Commands:
                 if name == CommandName.DISMISS or request.candidate:
                     loop.call_soon_threadsafe(self._decide_candidate, name, request, sender, reply)
                     return reply
-                loop.call_soon_threadsafe(self._adoption.begin, name, request, reply, sender)
+                loop.call_soon_threadsafe(self._begin_change, name, request, sender, reply)
                 return reply
         except ServiceError as error:
             if loop is not None:
@@ -136,7 +136,7 @@ class Commands:
             try:
                 self._answer(compensation, name, arguments)
             except ServiceError as error:
-                self._note_refusal(name, str(error), sender)
+                self._note_refusal(name, f"{name}: {error}", sender)
 
     def _answer(self, compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
         """Pass a command on to the loop; the candidate that was meant may have given its place since the answer."""
@@ -162,7 +162,12 @@ class Commands:
                 raise ServiceError("the service is ending")
             if self._is_answered:
                 raise ServiceError("the candidate was answered already, which acts at the next sample")
-            offer = self._models.offer(self._running(), force=request.force or name == CommandName.DISMISS)
+            if self._adoption.is_under_way:
+                raise ServiceError("another model is being prepared; answer again after the next sample")
+            unproposed = "wait, or use --force"
+            if name == CommandName.DISMISS:
+                unproposed = "" if request.sha256 else "name it: compensator dismiss HASH"
+            offer = self._models.offer(self._running(), request.sha256, unproposed="" if request.force else unproposed)
         except ServiceError as error:
             self._note_refusal(name, f"{name}: {error}", sender)
             reply.set_result(refusal(f"{name}: {error}"))
@@ -173,6 +178,15 @@ class Commands:
         text = f"candidate {offer.named} {done}; {described(offer.comparison)}; acts at the next sample"
         figures = {"model_sha256": offer.sha256, "comparison": offer.comparison.table()}
         reply.set_result({"ok": True, "text": text} | figures)
+
+    def _begin_change(self, name: str, request: ModelRequest, sender: Sender, reply: Future[dict[str, Any]]) -> None:
+        """Begin to change the model, unless an answer that is accepted would be lost by it. In the loop only."""
+        if not self._is_answered:
+            self._adoption.begin(name, request, reply, sender)
+            return
+        why = f"{name}: the candidate was answered, which acts at the next sample; retry after it"
+        self._note_refusal(name, why, sender)
+        reply.set_result(refusal(why))
 
     def drain_probes(self) -> tuple[list[ReceivedProbe], list[Probe]]:
         """Return the probes that arrived since the last call, and records of those that are not decided."""

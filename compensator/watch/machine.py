@@ -417,7 +417,7 @@ class WatchedMachine:
         if status is None or isinstance(status.loop, UnsetType):
             return None
         found = msgspec.structs.asdict(status.loop)
-        commands = loop_commands(self.config) if _is_proposed(status) else ()
+        commands = loop_commands(status.loop.model_sha256, self.config) if _is_proposed(status) else ()
         return found | {"line": loop_text(found), "commands": list(commands)}
 
     def _fresh(self, name: str, now_ns: int, monotonic_s: float) -> bool:

@@ -105,7 +105,7 @@ def to_do(event: Event, config: str = CONFIG) -> str:
     if event.kind == EventKind.DIAGNOSIS:
         return str(event.data.get("needs", ""))
     if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
-        yes, no = loop_commands(config)
+        yes, no = loop_commands(str(event.data.get("model_sha256", "")), config)
         return f"Answer with `{yes}` or `{no}`."
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
@@ -133,16 +133,17 @@ def probe_text(probe: dict[str, Any]) -> str:
     return f"No probe wanted ({figures}). {PROBE_FOR}"
 
 
-def loop_commands(config: str = CONFIG) -> tuple[str, str]:
-    """Return what a person can answer to a candidate: yes and no.
+def loop_commands(sha256: str, config: str = CONFIG) -> tuple[str, str]:
+    """Return what a person can answer to a candidate: yes and no, about this one and no other.
 
     Examples
     --------
-    >>> loop_commands("vmc 07.toml")[1]
-    "compensator dismiss --config 'vmc 07.toml'"
+    >>> loop_commands("055e0d2a1b2c3d4e", "vmc 07.toml")[1]
+    "compensator dismiss 055e0d2a1b2c --config 'vmc 07.toml'"
     """
-    file = shlex.quote(config)
-    return f"compensator adopt --candidate --config {file}", f"compensator dismiss --config {file}"
+    rest = f" --config {shlex.quote(config)}"
+    rest = f" {sha256[:12]}{rest}" if sha256 else rest
+    return f"compensator adopt --candidate{rest}", f"compensator dismiss{rest}"
 
 
 def loop_text(loop: Mapping[str, Any]) -> str:

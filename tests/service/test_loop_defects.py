@@ -93,7 +93,7 @@ async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
 
 async def test_at_an_operators_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    machine.at_sample[EVENING + 60] = Asked(machine, "dismiss")
+    machine.at_sample[EVENING + 60] = Asked(machine, "dismiss", force=True)
     broken = Breaks(monkeypatch, Loop, "dismiss")
     await machine.run(EVENING + 120)
     assert broken.calls and "a defect" in said(machine)

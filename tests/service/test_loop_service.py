@@ -236,7 +236,7 @@ async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_p
 async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(tmp_path: Path) -> None:
     """Of a yes and a no within a minute only the first acts, and the second is not told that it does."""
     machine = Looping(tmp_path, shown(extended()), policy="propose")
-    yes, no = Asked(machine, "adopt", candidate=True, force=True), Asked(machine, "dismiss")
+    yes, no = Asked(machine, "adopt", candidate=True, force=True), Asked(machine, "dismiss", force=True)
 
     def both() -> None:
         yes()
@@ -251,9 +251,23 @@ async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(t
 
 async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    no = machine.at_sample[EVENING + 60] = Asked(machine, "dismiss")
+    # It is not proposed: who answers has read of another one.
+    late = machine.at_sample[EVENING + 50] = Asked(machine, "dismiss")
+    other = machine.at_sample[EVENING + 55] = Asked(machine, "dismiss", sha256="0" * 12)
+    no = Asked(machine, "dismiss", sha256=sha256_of(extended())[:12])
+    back = Asked(machine, "back")
+
+    def both() -> None:
+        no()
+        back()
+
+    machine.at_sample[EVENING + 60] = both
     await machine.run(1440 + EVENING + 60)
+    assert not late.answer["ok"] and "compensator dismiss HASH" in late.answer["text"], late.answer
+    assert not other.answer["ok"] and "candidate 000000000000 has given its place" in other.answer["text"]
     assert no.answer["ok"], no.answer
+    # What has been answered is not lost by another change of the model within the minute.
+    assert not back.answer["ok"] and "the candidate was answered" in back.answer["text"], back.answer
     again = machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "dismiss")
     await machine.run(20)
     assert machine.steps()[2:5] in ([("end", "dismissed"), ("diagnose", "planned"), ("nothing", "avoided")],), (

@@ -396,7 +396,7 @@ async def test_the_service_proposes_what_surpasses_a_proposal_and_a_replay_decid
 async def test_an_answer_to_a_candidate_that_has_given_its_place_is_refused(tmp_path: Path, name: str) -> None:
     """Another one with the same effects takes the place between the answer and the sample with which it acts."""
     service = Early(tmp_path, shown(extended()), shown(extended(2.0)), shadow_h=6.0, acts=lambda i: 0.5)
-    arguments = {"candidate": True, "force": True} if name == "adopt" else {}
+    arguments = {"candidate": True, "force": True} if name == "adopt" else {"sha256": sha256_of(extended())[:12]}
     asked = Asked(service, name, **arguments)
 
     def between() -> None:

@@ -179,12 +179,12 @@ class ModelLoop:
         self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
         self.drop_ended()
 
-    def offset_change_um(self, present: Compensation) -> float | None:
-        """Return by how much the offset would move if the candidate was adopted now, µm; None if that is unknown."""
-        candidate = self.state.candidate
+    def offset_change_um(self, present: Compensation, sha256: str) -> float | None:
+        """Return by how much the offset would move if a candidate was adopted now, µm; None if that is unknown."""
+        candidate = self.state.place(sha256)
         if candidate is None:
             return None
-        shadow = self.shadows[candidate.sha256]
+        shadow = self.shadows[sha256]
         new = Compensation(self._config, shadow.compensation.model)
         new.restore(shadow.compensation.state())
         new.raise_level(self.loop.compared(candidate).level_at_adoption_um)

@@ -220,23 +220,31 @@ class LiveLoop:
         """
         self._guarded(lambda core: self._note(core.loop.accept(sha256)), None)
 
-    def offer(self, present: Compensation, *, force: bool) -> Offer:
-        """Return what an operator would adopt, and by how much the offset would move.
+    def offer(self, present: Compensation, sha256: str, *, unproposed: str) -> Offer:
+        """Return what an operator decides on, and by how much the offset would move.
+
+        Parameters
+        ----------
+        present : Compensation
+            The present one.
+        sha256 : str
+            The beginning of the hash of the candidate that is meant; empty: the one that is proposed.
+        unproposed : str
+            What to do about a candidate that is not proposed; empty where it can be decided on, too.
 
         Raises
         ------
         ServiceError
-            If there is no candidate, or it is not proposed and `force` is not given.
+            If there is no such candidate, or it is not proposed and `unproposed` is given.
         """
-        state = self._core.state if self._core is not None else None
-        candidate = state.candidate if state is not None and not state.exchange else None
-        if candidate is None:
+        core = self._core
+        if core is None or core.state.exchange:
             raise ServiceError("there is no candidate now; see `compensator watch`")
+        candidate = core.loop.meant(sha256)
         words = f"{candidate.sha256[:12]} ({named(candidate.effects)})"
-        assert self._core is not None
-        verdict = changed(candidate.verdict, offset_change_um=self._core.offset_change_um(present))
-        if not candidate.is_proposed and not force:
-            raise ServiceError(f"candidate {words} is not proposed yet: {described(verdict)}; wait, or use --force")
+        verdict = changed(candidate.verdict, offset_change_um=core.offset_change_um(present, candidate.sha256))
+        if not candidate.is_proposed and unproposed:
+            raise ServiceError(f"candidate {words} is not proposed yet: {described(verdict)}; {unproposed}")
         return Offer(candidate.sha256, words, verdict)
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:

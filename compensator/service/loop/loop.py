@@ -332,7 +332,7 @@ class Loop:
         ServiceError
             If there is none, or another one.
         """
-        candidate = self._meant(sha256, "adopt --candidate")
+        candidate = self.meant(sha256)
         if self.state.exchange:
             return []
         notes = decide_exchange(self.state, "adopt", candidate, self.compared)
@@ -347,7 +347,7 @@ class Loop:
         ServiceError
             As `accept`.
         """
-        candidate = self._meant(sha256, "dismiss")
+        candidate = self.meant(sha256)
         if self.state.exchange:
             return []
         avoid(self.state, candidate.effects, now_ns, self._settings.watch_h)
@@ -357,16 +357,21 @@ class Loop:
             notes += end_diagnosis(self.state, "dismissed")  # newer parameters of them are refused, too
         return notes
 
-    def _meant(self, sha256: str, command: str) -> Place:
-        """Return the candidate that an operator's answer is about."""
+    def meant(self, sha256: str = "") -> Place:
+        """Return the candidate that an operator's answer is about, by the beginning of its hash; empty: the first one.
+
+        Raises
+        ------
+        ServiceError
+            If there is none, or another one.
+        """
         first = self.state.candidate
         if first is None:
-            raise ServiceError(f"{command}: there is no candidate now; see `compensator watch`")
-        meant = [place for place in self.state.candidates if place.sha256 == sha256] if sha256 else [first]
+            raise ServiceError("there is no candidate now; see `compensator watch`")
+        meant = [place for place in self.state.candidates if place.sha256.startswith(sha256)] if sha256 else [first]
         if not meant:
             raise ServiceError(
-                f"{command}: candidate {sha256[:12]} has given its place; now there is {_named(first)}; "
-                "see `compensator watch`"
+                f"candidate {sha256[:12]} has given its place; now there is {_named(first)}; see `compensator watch`"
             )
         return meant[0]
 

@@ -158,6 +158,11 @@ class Adoption:
         #: Set when a model that is being prepared must no longer be stored.
         self._given_up = threading.Event()
 
+    @property
+    def is_under_way(self) -> bool:
+        """Whether a model is being prepared."""
+        return self._order is not None
+
     def begin(self, action: str, request: ModelRequest, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
         exchanging = self._loop is not None and self._loop.is_exchanging
