@@ -158,7 +158,7 @@ def _model(loaded: LoadedConfig) -> tuple[ThermalModel, bytes, ModelStore]:
         model = model_of(config, configured, source=config.model.file)
     except ModelError as error:
         raise ConfigError(f"{loaded.path}: model: {error}") from error
-    store = ModelStore(loaded.store(), configured)
+    store = ModelStore(loaded.store(), configured, config.machine.name)
     try:
         data = store.in_use()
         if data != configured:

@@ -192,7 +192,7 @@ def test_recordings(place: Path, capfd: pytest.CaptureFixture[str], recorded: by
 @given(seed=SEED)
 def test_stores_of_models(place: Path, seed: int) -> None:
     folder, quill = place / "models", read_model_bytes("quill")
-    store = ModelStore(folder, quill)
+    store = ModelStore(folder, quill, "vmc-07")
     if not (place / "adopted.json").exists():
         store.adopt(quill + b"\n# another\n", name="another", time_utc_ns=1)
         (place / "adopted.json").write_bytes((folder / "adopted.json").read_bytes())

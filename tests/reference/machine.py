@@ -137,7 +137,7 @@ class Machine:
 
     async def _run(self, samples: int, broken: int | None) -> None:
         config = parse_config(self.config, source="reference")
-        store = ModelStore(self.folder / "models", self.model)
+        store = ModelStore(self.folder / "models", self.model, MACHINE)
         data = store.in_use()
         loaded = LoadedConfig(config=config, path=self.folder / "machine.toml", data=self.config, sha256="unused")
         note = EarlyNote(self.recordings, MACHINE, self.folder)

@@ -84,7 +84,7 @@ class Machine:
 
     @property
     def store(self) -> ModelStore:
-        return ModelStore(self.recordings / "models", self.configured)
+        return ModelStore(self.recordings / "models", self.configured, MACHINE)
 
     def command(self, name: str, payload: bytes = b"") -> Any:
         assert self.daemon is not None

@@ -152,7 +152,7 @@ class SeveralAxes:
 
     @property
     def store(self) -> ModelStore:
-        return ModelStore(self.folder / "rec" / "models", self.configured)
+        return ModelStore(self.folder / "rec" / "models", self.configured, MACHINE)
 
     def run(self, samples: int, at_sample: Mapping[int, Any] | None = None) -> None:
         """Start the service, run it, end it cleanly."""

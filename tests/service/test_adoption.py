@@ -395,7 +395,7 @@ async def test_before_the_first_zero_there_is_nothing_to_warm_up(tmp_path: Path)
 
 
 def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp_path: Path) -> None:
-    store = ModelStore(tmp_path / "models", QUILL)
+    store = ModelStore(tmp_path / "models", QUILL, MACHINE)
     assert store.in_use() == QUILL
     with pytest.raises(ServiceError, match="no previous model"):
         store.before()
@@ -410,7 +410,7 @@ def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp
         ("back", "stronger"),
     ]
     assert store.load(sha256_of(WITH_INPUT)) == WITH_INPUT
-    edited = ModelStore(tmp_path / "models", WITH_INPUT)  # somebody has configured another model since
+    edited = ModelStore(tmp_path / "models", WITH_INPUT, MACHINE)  # somebody has configured another model since
     assert edited.in_use() == WITH_INPUT
     with pytest.raises(ServiceError, match="no previous model"):
         edited.before()
@@ -418,8 +418,17 @@ def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp
     with pytest.raises(ServiceError, match="the file was changed"):
         store.in_use()
     (store.folder / "adopted.json").write_bytes(b"{")
-    with pytest.raises(ServiceError, match="remove it to use the configured model"):
+    with pytest.raises(ServiceError, match="adopt a model, or remove it to use the configured one"):
         store.in_use()
+    store.adopt(WITH_INPUT, name="coolant", time_utc_ns=4)
+    assert store.in_use() == WITH_INPUT and (store.folder / "adopted.damaged").read_bytes() == b"{"
+    # Two machines in one folder: the model of the one is not taken over by the other.
+    other = ModelStore(tmp_path / "models", QUILL, "vmc-08")
+    with pytest.raises(ServiceError, match="of machine vmc-07, expected vmc-08"):
+        other.in_use()
+    with pytest.raises(ServiceError, match=r"recording\.folder of its own"):
+        other.adopt(STRONGER, name="stronger", time_utc_ns=5)
+    assert store.in_use() == WITH_INPUT
 
 
 async def test_couples_that_a_person_has_put_right_are_no_fault_of_a_model_adopted_afterwards(tmp_path: Path) -> None:

@@ -398,7 +398,7 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
     core.state.watched = Place(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
     core.state.exchange, core.state.incoming = "back", sha256_of(QUILL)
     core.shadows[sha256_of(QUILL)] = Shadow(before, QUILL)
-    store = ModelStore(tmp_path, QUILL)
+    store = ModelStore(tmp_path, QUILL, "vmc-07")
     store.adopt(extended(), name="extended", time_utc_ns=1, by_loop=True)
     events, files = Mock(), Mock()
     loop = live.LiveLoop(

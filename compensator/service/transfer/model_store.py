@@ -35,12 +35,20 @@ class Adopted(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Contents(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """`adopted.json`: the models in use, the present one last, and every change."""
+    """`adopted.json`: the machine, the models in use, the present one last, and every change.
+
+    Files of version 0.1.0 name no machine.
+    """
 
     schema: Literal[1] = 1
+    machine: str | UnsetType = UNSET
     configured_sha256: str
     in_use: list[Adopted] = []
     history: list[Adopted] = []
+
+
+class _DamagedError(ServiceError):
+    """The list of adopted models cannot be read."""
 
 
 class ModelStore:
@@ -52,6 +60,8 @@ class ModelStore:
         Created with the first model.
     configured : bytes
         The model file that the configuration names.
+    machine : str
+        Name of the machine: the models of another one are not its own.
 
     Raises
     ------
@@ -59,9 +69,10 @@ class ModelStore:
         By any method, if the folder cannot be used; the message names the file.
     """
 
-    def __init__(self, folder: Path, configured: bytes) -> None:
+    def __init__(self, folder: Path, configured: bytes, machine: str) -> None:
         self.folder = folder
         self.configured = configured
+        self._machine = machine
         self._configured_sha256 = sha256_of(configured)
 
     def in_use(self) -> bytes:
@@ -100,8 +111,12 @@ class ModelStore:
         return data
 
     def adopt(self, data: bytes, *, name: str, time_utc_ns: int, by_loop: bool = False) -> None:
-        """Store a model and use it from now on."""
-        contents = self._read()
+        """Store a model and use it from now on; a damaged list of adopted models is put aside."""
+        try:
+            contents = self._read()
+        except _DamagedError:
+            self._put_aside()
+            contents = self._read()
         by: Literal["loop"] | UnsetType = "loop" if by_loop else UNSET
         entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns, by=by)
         contents.in_use.append(entry)
@@ -126,14 +141,27 @@ class ModelStore:
         try:
             contents = msgspec.json.decode(read_file(path, RESULT_BYTES), type=_Contents)
         except FileNotFoundError:
-            return _Contents(configured_sha256=self._configured_sha256)
+            return _Contents(machine=self._machine, configured_sha256=self._configured_sha256)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}") from error
         except UNREADABLE as error:
-            raise ServiceError(f"{path}: {error}; remove it to use the configured model") from error
+            raise _DamagedError(f"{path}: {error}; adopt a model, or remove it to use the configured one") from error
+        if contents.machine not in (UNSET, self._machine):
+            raise ServiceError(
+                f"{path}: of machine {contents.machine}, expected {self._machine}: each machine needs a "
+                "recording.folder of its own"
+            )
+        contents.machine = self._machine
         if contents.configured_sha256 != self._configured_sha256:
-            return _Contents(configured_sha256=self._configured_sha256, history=contents.history)
+            contents.configured_sha256, contents.in_use = self._configured_sha256, []
         return contents
+
+    def _put_aside(self) -> None:
+        path = self.folder / _FILE
+        try:
+            path.replace(path.with_suffix(".damaged"))
+        except OSError as error:
+            raise ServiceError(f"{path}: {error.strerror or error}; the model is not stored") from error
 
     def _write(self, contents: _Contents) -> None:
         self._store(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
