@@ -14,6 +14,7 @@ from compensator.events import CommandName, ComparisonData
 from compensator.model.model_file import read_model_bytes
 from compensator.service.command_client import NotReached, ask
 from compensator.service.loading import Setup, load
+from compensator.service.presence import is_used
 from compensator.service.transfer.model_store import check_model
 from compensator.service.transfer.second_opinion import described, refuse_if_worse, second_opinion
 
@@ -40,6 +41,7 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.ADOPT, wanted, setup, arguments)
     if reply is not None:
         return answered(reply, service_reached=True)
+    _refuse_beside_a_service(setup, force=arguments.force)
     if model.sha256 == setup.model.sha256:
         raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
@@ -64,6 +66,7 @@ def back(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.BACK, {"force": arguments.force}, setup, arguments)
     if reply is not None:
         return answered(reply, service_reached=True)
+    _refuse_beside_a_service(setup, force=arguments.force)
     model = check_model(setup.config, setup.store.before(), source="previous model")
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
@@ -95,6 +98,17 @@ def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Na
         return ask(setup.config.zenoh, name, payload, timeout_s=arguments.timeout, operator=operator)
     except NotReached:
         return None
+
+
+def _refuse_beside_a_service(setup: Setup, *, force: bool) -> None:
+    """Refuse to change the model of the next start under a service that runs: its loop may change it, too."""
+    machine = setup.config.machine.name
+    if is_used(setup.recordings, machine) and not force:
+        raise ServiceError(
+            f"a service of {machine} runs here and could not be reached: correct the connection (its router, the table "
+            "[zenoh], --zenoh), or stop it; --force stores the model for its next start all the same",
+            {"ok": False, "service_reached": False},
+        )
 
 
 def _stored(kept: str, sha256: str, found: ComparisonData) -> Answer:

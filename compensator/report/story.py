@@ -62,8 +62,8 @@ class Step:
         The event in one line.
     model_sha256 : str
         The model that it is about; empty where it is about none.
-    effects : tuple of str
-        Its effects.
+    effects : tuple of str or None
+        Its effects; None where the recording does not name them.
     by : str
         Who decided.
     comparison : ComparisonData, optional
@@ -74,7 +74,7 @@ class Step:
     what: str
     text: str
     model_sha256: str = ""
-    effects: tuple[str, ...] = ()
+    effects: tuple[str, ...] | None = ()
     by: str = _BY_LOOP
     comparison: ComparisonData | None = None
 
@@ -141,6 +141,7 @@ class Story:
     def _add_exchange(self, event: Event) -> None:
         """Add a change of the model that an operator has ordered; that of the loop follows from its decision."""
         at_s, data, decided = event.time_utc_ns * _NS, event.data, self._decided
+        effects = data.get("effects")
         self._decided = None
         if decided is not None and at_s - decided.at_s <= _FOLLOWS_S and data.get("ok") is True:
             return
@@ -151,7 +152,7 @@ class Story:
                 what=str(data.get("action", CommandName.ADOPT)) if data.get("ok") is True else "refused",
                 text=event.text,
                 model_sha256=str(data.get("new_sha256", "")),
-                effects=tuple(map(str, data.get("effects", ()))),
+                effects=tuple(map(str, effects)) if isinstance(effects, list) else None,
                 by=self._sender or _BY_OPERATOR,
                 comparison=comparison.comparison if comparison is not None else None,
             )
@@ -270,7 +271,7 @@ def _strips(
     names: Mapping[str, str],
     x_limits: tuple[float, float],
 ) -> Figure:
-    effects = {step.model_sha256: step.effects for step in story.steps if step.model_sha256}
+    effects = {step.model_sha256: step.effects or () for step in story.steps if step.model_sha256}
     shown = list(in_force.items())[-_MODELS:]
     strips = [
         Strip(_model(sha, names, effects), tuple(pieces), i % 4) for i, (sha, pieces) in enumerate(shown) if pieces
@@ -319,7 +320,8 @@ def story_tables(story: Story) -> list[Block]:
 
 def _row(step: Step) -> list[Cell]:
     found = step.comparison
-    effects = ", ".join(step.effects) or ("no added effect" if step.model_sha256 else "")
+    is_known = step.model_sha256 and step.effects is not None
+    effects = ", ".join(step.effects or ()) or ("no added effect" if is_known else "")
     model = f"{step.model_sha256[:6]} {effects}".strip()
     figures = ["", ""]
     if found is not None:

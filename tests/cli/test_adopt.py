@@ -19,6 +19,8 @@ import zenoh
 from compensator.cli import main
 from compensator.demo.machine import configuration, hardware
 from compensator.recording.reading import read_messages, recordings
+from compensator.service.loading import load
+from compensator.service.presence import sole_user
 from compensator.service.transfer.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_commands import load_fast_model
@@ -41,6 +43,22 @@ def stronger(folder: Path, base: Path, change: float = 0.3) -> Path:
     path = folder / f"stronger-{change}.toml"
     path.write_text(base.read_text(encoding="utf-8") + effect, encoding="utf-8")
     return path
+
+
+def test_a_service_that_runs_and_is_not_reached_keeps_its_model(
+    idle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its loop may change the model meanwhile."""
+    quill = Path(__file__).parents[2] / "compensator/model/quill.toml"
+    before, other = in_use(idle, capsys), stronger(tmp_path, quill)
+    with sole_user(load(str(idle)).recordings, "vmc-07"):
+        for words in (["adopt", str(other)], ["back"]):
+            assert main([*words, "--config", str(idle)]) == 1
+            assert "a service of vmc-07 runs here and could not be reached" in capsys.readouterr().err
+        assert in_use(idle, capsys) == before
+        assert main(["adopt", str(other), "--config", str(idle), "--force"]) == 0
+        capsys.readouterr()
+    assert in_use(idle, capsys) == sha256_of(other.read_bytes())
 
 
 def result(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:

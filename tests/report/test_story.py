@@ -16,7 +16,7 @@ from compensator.report.gathering import read_history
 from compensator.report.history import History
 from compensator.report.page import html_of
 from compensator.report.recordings import figures, page_of, verdict
-from compensator.report.story import Story, figures_of, in_words
+from compensator.report.story import Story, _row, figures_of, in_words
 from tests.audit.made import MACHINE, Service, other_model, readings
 
 CANDIDATE, BEFORE = "c" * 64, "b" * 64
@@ -54,7 +54,13 @@ TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
         1701,
         "adopt",
         "model d replaces c",
-        {"ok": True, "action": "adopt", "new_sha256": "d" * 64, "comparison": FIGURES.table()},
+        {
+            "ok": True,
+            "action": "adopt",
+            "new_sha256": "d" * 64,
+            "effects": ["hysteresis:all"],
+            "comparison": FIGURES.table(),
+        },
     ),
     (
         1900,
@@ -109,8 +115,15 @@ def test_the_exchange_that_follows_a_decision_of_the_loop_is_not_a_second_adopti
 
 def test_an_operator_is_named(text: str) -> None:
     (ordered,) = [row for row in rows(text) if row[1:2] == ["adopted"] and row[2] != "the loop"]
-    assert ordered[2] == "engineer-3"
+    assert ordered[2] == "engineer-3" and ordered[3] == "dddddd hysteresis:all"
     assert ordered[4] == "6.9 → 1.2"
+
+
+def test_a_recording_that_names_no_effects_says_nothing_of_them() -> None:
+    data = {"ok": True, "action": "adopt", "new_sha256": "d" * 64}
+    story = Story()
+    story.add(Event(schema=1, machine="m", seq=1, time_utc_ns=1, kind="adopt", text="model d replaces c", data=data))
+    assert _row(story.steps[0])[3] == "dddddd"
 
 
 def test_nights_without_a_result_fill_no_table_but_are_counted(history: History, text: str) -> None:

@@ -28,6 +28,7 @@ from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.live import LiveLoop
+from compensator.service.loop.weighing import effect_names
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
@@ -213,6 +214,7 @@ class Adoption:
                 "action": order.action,
                 "old_sha256": old.model.sha256,
                 "new_sha256": new.model.sha256,
+                "effects": effect_names(new.model),
                 **candidate.figures(),
                 "difference_um": difference,
                 "y_std_um": after.std_um,
