@@ -539,6 +539,11 @@ class DataRemark(Code):
         "Many cells of a column are words, so it is taken as a column of words and left out.",
         "If it is a channel, leave the cells empty where its value is missing.",
     )
+    COLUMN_UNNAMED = (
+        "column_unnamed",
+        "A column has no name, or one with characters that no message can show, and is left out.",
+        "If it is a channel, name it in the header; of an index that pandas writes: to_csv(FILE, index=False).",
+    )
     ROWS_SORTED = (
         "rows_sorted",
         "Rows of the table were out of order and have been sorted by time.",
@@ -603,6 +608,11 @@ class DataRemark(Code):
         "column_copy",
         "A channel has the values of another one in every row; only the first of them is searched.",
         "Give each sensor a column of its own; of two switches that always act together, no data can tell which acts.",
+    )
+    COLUMN_COUNTS = (
+        "column_counts",
+        "A channel takes many values and never falls: a count or a clock, not a cause; it is left out.",
+        "If what it counts may act, log its rate: a speed, a power, parts an hour.",
     )
     FOLLOWS_Y = (
         "follows_y",

@@ -111,7 +111,8 @@ def _names(header: Sequence[str], separator: str) -> set[str]:
 
 def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[str]:
     check_columns(str(path), len(cells))
-    header = [name.strip() for name in cells]
+    # What has no name is left out later: the index that pandas writes, or columns behind the last separator.
+    header = [name.strip() or " " * i for i, name in enumerate(cells)]
     for name, count in Counter(header).items():
         if count > 1:
             raise DataError(f"{path}: the header names column {name[:64]!r} twice, expected each name once")

@@ -182,6 +182,9 @@ def table_of(
         if column in (time_column, *TIMES):
             continue
         is_needed = column in DATA_ROLES or column in (roles or {}).values()
+        if not (is_needed or (column.strip() and column.isprintable())):
+            remarks += _unnamed(name, list(arrays).index(column) + 1, values)
+            continue
         converted, left_out = _numbers(name, column, values, rows, is_needed=is_needed)
         if converted is not None:
             numbers[column] = converted
@@ -262,6 +265,13 @@ def _numbers(
         i = int(np.argmax(np.isinf(numbers)))
         raise DataError(f"{name}: row {rows[i]}: {column} = {numbers[i]}, expected a finite number")
     return numbers, ()
+
+
+def _unnamed(name: str, number: int, values: np.ndarray[Any, Any]) -> Iterator[Remark]:
+    """Yield a remark on a column that is left out for its name, if it holds anything."""
+    if any(str(value).strip() not in ("", "None", "nan") for value in values.tolist()):
+        words = f"{name}: column {number} has no name, or one that cannot be shown; it is left out."
+        yield Remark(DataRemark.COLUMN_UNNAMED, words)
 
 
 def _without_bad(

@@ -1,4 +1,4 @@
-"""Channels that are no cause of Y: those without values, copies of others, and measurements of Y itself."""
+"""Channels that are no cause of Y: those without values, copies of others, counts, and measurements of Y itself."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ SAME_NOISE, LEAST = 0.4, 300
 QUIET, SHARP = 3.0, 0.3
 #: A channel is Y times a constant where it differs from it by so many times the noise of both, and moves by so many.
 ALIKE, MOVES = 2.0, 30.0
+#: Two columns with at least so many values each are the same measurement where one is the other times a constant to
+#: within half a digit of both; what takes as many and never falls is a count.
+DISTINCT, SAME = 20, 1e-9
 #: Values are the same to so many digits after the point: T_Q is stored as its difference from AT.
 _DIGITS = 9
 
@@ -52,17 +55,31 @@ def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
             if other != channel:
                 words = f"{name}: {channel} has the values of {other} in every row; {other} alone is searched."
                 found[channel] = Remark(DataRemark.COLUMN_COPY, words)
+            elif counts(parts, is_temperature=channel.endswith(DEGC)):
+                words = f"{name}: {channel} never falls: a count or a clock, not a cause; log its rate."
+                found[channel] = Remark(DataRemark.COLUMN_COUNTS, words)
             elif measures_y(parts, y, is_temperature=channel.endswith(DEGC)):
                 words = f"{name}: {channel} follows y_um without delay: a second measurement of Y, not a cause."
                 found[channel] = Remark(DataRemark.FOLLOWS_Y, words)
     return found
 
 
+def counts(channel: Sequence[Vector], *, is_temperature: bool) -> bool:
+    """Whether a channel counts something, such as rows, parts, hours or energy: it takes many values and never falls.
+
+    What it says is how late it is, and a drift of Y that is called by its name goes on for ever. A temperature may rise
+    all the time that a record lasts.
+    """
+    rises = all(np.all(np.diff(part) >= 0.0) for part in channel)
+    return not is_temperature and rises and np.unique(np.concatenate(list(channel))).size >= DISTINCT
+
+
 def measures_y(channel: Sequence[Vector], y: Sequence[Vector], *, is_temperature: bool) -> bool:
     """Whether a channel measures Y: it has the noise of Y, or is Y times a constant to within the noise of both.
 
-    Heat moves no temperature from one sample to the next as noise moves a probe, so what a channel shares with Y there
-    is Y. A temperature may be proportional to Y; what is commanded has no noise.
+    Whatever noise it has, it measures Y where it is Y times a constant to the digit. Heat moves no temperature from one
+    sample to the next as noise moves a probe, so what a channel shares with Y there is Y. A temperature may be
+    proportional to Y; what is commanded has no noise.
 
     Parameters
     ----------
@@ -73,6 +90,8 @@ def measures_y(channel: Sequence[Vector], y: Sequence[Vector], *, is_temperature
     """
     both = [np.column_stack([u, v])[np.isfinite(u) & np.isfinite(v)] for u, v in zip(channel, y, strict=True)]
     table = np.concatenate(both)
+    if not is_temperature and _is_a_multiple(*table.T):
+        return True
     steps = np.diff(table[:, 0])
     if len(table) < LEAST or not np.ptp(table, axis=0).all() or float(np.mean(steps == 0.0)) > LIVELY_STILL:
         return False
@@ -83,6 +102,17 @@ def measures_y(channel: Sequence[Vector], y: Sequence[Vector], *, is_temperature
     noise = float(np.hypot(noise_std(u), gain * noise_std(v)))
     left = float(np.std(u - gain * v - level))
     return not is_temperature and 0.0 < left < ALIKE * noise and float(np.ptp(u)) > MOVES * noise
+
+
+def _is_a_multiple(u: Vector, v: Vector) -> bool:
+    """Return whether one column is the other times a constant and a level, to within half a digit of both."""
+    values = [np.unique(one) for one in (u, v)]
+    if min(one.size for one in values) < DISTINCT:
+        return False
+    digit_u, digit_v = (float(np.min(np.diff(one))) for one in values)
+    gain, level = np.polyfit(v, u, 1)
+    digits = 0.51 * (digit_u + abs(float(gain)) * digit_v)
+    return float(np.max(np.abs(u - gain * v - level))) <= max(digits, SAME * float(np.ptp(u)))
 
 
 def _noise_correlation(second: Matrix) -> float:

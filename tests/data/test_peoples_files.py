@@ -78,6 +78,19 @@ def test_a_column_of_words_is_left_out(run: Path, tmp_path: Path) -> None:
     assert remark.code == "column_left_out" and "row 3: program = 'O1234' (480 like it): no number" in remark
 
 
+def test_a_column_without_a_name_is_left_out(run: Path, tmp_path: Path) -> None:
+    """The index that pandas writes; and what stands behind the last separator of a spreadsheet."""
+    lines = run.read_text(encoding="utf-8").splitlines()
+    table = [f",{lines[0]},,", *(f"{i},{line},,{7 if i == 3 else ''}" for i, line in enumerate(lines[1:]))]
+    (tmp_path / "run.csv").write_text("\n".join(table), encoding="utf-8")
+    found = tc.read(tmp_path / "run.csv")
+    assert found.table.columns.keys() == tc.read(run).table.columns.keys()
+    assert [remark.code for remark in found.remarks] == ["column_unnamed"] * 2
+    assert "column 1 has no name" in found.remarks[0] and "to_csv(FILE, index=False)" in found.remarks[0].marked
+    strange = arrays(run) | {" ": np.arange(720.0), "T\nS": np.arange(720.0), "a\u202eb": np.arange(720.0)}
+    assert tc.read(strange).table.columns.keys() == found.table.columns.keys()
+
+
 def test_a_value_marked_bad_is_not_used(run: Path, tmp_path: Path) -> None:
     lines = run.read_text(encoding="utf-8").splitlines()
     marks = {100: "stuck", 101: "Over_Range", 300: ""}

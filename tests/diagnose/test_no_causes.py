@@ -38,6 +38,37 @@ def test_a_second_measurement_of_y_is_no_cause(name):
     assert "coolant_degc" in channels and name not in channels
 
 
+@pytest.mark.parametrize(("rows", "digit"), [(240, 0.0), (240, 1.0), (N, 1.0)])
+def test_a_scale_that_is_y_to_the_digit_measures_it_whatever_its_noise(rows, digit):
+    """In four hours, and with readings of a whole micrometre, no noise shows it."""
+    table = machine()
+    if digit:
+        table["y_um"] = np.round(table["y_um"] / digit) * digit
+    table |= {"scale_mm": np.round(table["y_um"] / 1000.0 + 5.0, 6), "scale_mm2": 0.4 * table["y_um"]}
+    table["power_w"] = np.round(40.0 * table["y_um"] + np.random.default_rng(1).normal(0.0, 400.0, N))
+    runs = runs_in(measurements({name: values[:rows] for name, values in table.items()}, "day"))[0]
+    found = no_causes("day", runs)
+    assert {name: str(remark.code) for name, remark in found.items()} == {
+        "scale_mm": "follows_y",
+        "scale_mm2": "follows_y",
+    }
+
+
+def test_a_count_is_no_cause_and_a_temperature_that_rises_may_be_one():
+    runs = day(
+        row=lambda table, rng: np.arange(N, dtype=float),
+        parts=lambda table, rng: np.floor(np.arange(N) / 13.0),
+        energy_kwh=lambda table, rng: np.cumsum(rng.random(N) * (np.arange(N) // 60 % 2)),
+        floor_degc=lambda table, rng: 20.0 + np.arange(N) / 500.0,
+        switched=lambda table, rng: 1.0 * (np.arange(N) > 300),
+        ramp_rpm=lambda table, rng: np.abs(np.arange(N) - 700.0),
+    )
+    found = no_causes("day", runs)
+    assert {name: str(remark.code) for name, remark in found.items()} == dict.fromkeys(
+        ("row", "parts", "energy_kwh"), "column_counts"
+    )
+
+
 def test_causes_with_and_without_delay_and_noise_stay():
     rpm = machine()["spindle_rpm"]
     runs = day(
