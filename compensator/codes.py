@@ -559,6 +559,11 @@ class DataRemark(Code):
         "Samples are missing; the gap is short compared with the machine's time constants and is interpolated.",
         "Nothing for a single gap; check the logger if there are many.",
     )
+    ROWS_APART = (
+        "rows_apart",
+        "Rows are further apart than the model's samples; the samples between them are interpolated.",
+        "Log a row for each sample: what comes and goes between two rows is not seen.",
+    )
     GAP_SPLITS = (
         "gap_splits",
         "Samples are missing; the gap is too long to interpolate and splits the record.",

@@ -83,11 +83,15 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     present[slot] = True
     records = []
     start = 0
-    for first, last in _gaps(present):
-        gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
-        if last - first <= SHORT_GAP_SAMPLES:
-            remarks.append(Remark(DataRemark.GAP_BRIDGED, f"{gap}; bridged."))
-        else:
+    usual = round(_spacing(t_s) / period_s) - 1 if t_s.size > 1 else 0
+    gaps = [(first, last) for first, last in _gaps(present) if last - first > usual]
+    if usual > 0:
+        words = f"{table.name}: its rows are {usual + 1} samples of {period_s:g} s apart; bridged."
+        remarks.append(Remark(DataRemark.ROWS_APART, words))
+    remarks += _bridged(table.name, [one for one in gaps if one[1] - one[0] <= SHORT_GAP_SAMPLES], period_s)
+    for first, last in gaps:
+        if last - first > SHORT_GAP_SAMPLES:
+            gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
             remarks.append(Remark(DataRemark.GAP_SPLITS, f"{gap}; the record is split there."))
             records.append((start, first))
             start = last
@@ -105,6 +109,18 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         ),
         remarks=tuple(remarks),
     )
+
+
+def _bridged(name: str, gaps: Sequence[tuple[int, int]], period_s: float) -> Iterator[Remark]:
+    """Yield a remark on each gap that is bridged, or one on many of them."""
+    if len(gaps) > _SHOWN:
+        longest, begin_s = max(last - first for first, last in gaps), gaps[0][0] * period_s
+        words = f"{name}: {len(gaps)} gaps of up to {longest} sample(s) from t_s = {begin_s:g} on; bridged."
+        yield Remark(DataRemark.GAP_BRIDGED, words)
+        return
+    for first, last in gaps:
+        words = f"{name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}; bridged."
+        yield Remark(DataRemark.GAP_BRIDGED, words)
 
 
 def _missing_inputs(

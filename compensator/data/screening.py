@@ -273,7 +273,9 @@ def _check_deformation(name: str, runs: Sequence[Run]) -> None:
     known, sparse = y[~np.isnan(y)], any(run.has_sparse_y for run in runs)
     if sparse and known.size < LEAST_VALUES:
         raise DataError(f"{name}: y_um has {known.size} values, expected at least {LEAST_VALUES} for a model")
-    if not sparse and known.size < (1.0 - MISSING_SHARE) * y.size:
+    # Of a log whose rows are further apart than the samples every row counts.
+    apart = float(np.median(np.diff(np.flatnonzero(~np.isnan(y))))) if known.size > 1 else 1.0
+    if not sparse and known.size * apart < (1.0 - MISSING_SHARE) * y.size:
         raise DataError(f"{name}: y_um is missing in {y.size - known.size} of {y.size} samples, expected at least half")
     check_deformation_scale(name, known)
     stated = runs[0].y_std_um
@@ -300,8 +302,8 @@ def check_deformation_scale(name: str, values: Vector) -> None:
         If all values are the same, or move by so little or so much that they are no µm.
     """
     known = values[~np.isnan(values)]
-    if known.size == 0:
-        return
+    if known.size <= 1:
+        return  # too few values say that themselves
     spread = float(np.ptp(known))
     if spread == 0.0:
         raise DataError(f"{name}: y_um = {known[0]:g} in every row: a dead probe, or a column of another meaning")

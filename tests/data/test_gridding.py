@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from compensator.codes import Remark
-from compensator.data.measurement import read
+from compensator.data.measurement import measurements, read, runs_in
 from compensator.data.runs import runs_of
+from compensator.data.screening import screen
+from compensator.errors import DataError
 from compensator.report.identification import _averaged
 
 ROWS = 240
@@ -41,6 +45,37 @@ def test_a_sparse_temperature_is_said_with_its_share(tmp_path: Path, every: int,
     found = remarks(tmp_path / "a.csv", [row(i, t_q=i % every != 1) for i in range(ROWS)])
     assert [one.code for one in found] == (["temperature_sparse"] if percent else [])
     assert percent in str(found[:1])
+
+
+def test_rows_that_are_further_apart_than_the_samples_are_said_once_and_real_gaps_beside(tmp_path: Path) -> None:
+    found = remarks(tmp_path / "a.csv", [row(i) for i in range(0, 3 * ROWS, 3) if not 300 <= i < 330])
+    assert [one.code for one in found] == ["rows_apart", "gap_bridged"]
+    assert "its rows are 3 samples of 60 s apart" in found[0] and "gap of 32 sample(s) from t_s = 17880" in found[1]
+
+
+def test_many_gaps_are_said_in_one_remark(tmp_path: Path) -> None:
+    found = remarks(tmp_path / "a.csv", [row(i) for i in range(ROWS) if i % 20 not in (7, 8)])
+    assert [one.code for one in found] == ["gap_bridged"] and "12 gaps of up to 2 sample(s) from t_s = 420" in found[0]
+
+
+@pytest.mark.parametrize("every", [2, 4])
+def test_every_row_of_a_log_with_rows_further_apart_counts(every: int) -> None:
+    """Although Y is known in fewer than half of the samples."""
+    i = np.array([one for one in range(0, 1440, every) if one % 200 >= 3 * every])
+    heat = lfilter([0.02], [1.0, -0.98], np.repeat([0.0, 1.0, 0.3, 0.0], 360))[i]
+    noise = np.random.default_rng(1).normal(0.0, 0.2, i.size)
+    table = {
+        "t_s": 60.0 * i,
+        "t_q_degc": 20.0 + 12.0 * heat,
+        "at_degc": 20.0 + np.sin(i / 200.0),
+        "y_um": 60.0 * heat + noise,
+    }
+    runs, _ = runs_in(measurements(table, "log"))
+    assert np.sum(np.isfinite(runs[0].y_um)) < runs[0].y_um.size / 2
+    screen("log", runs, 60.0, needs_heat=False)
+    runs, _ = runs_in(measurements(table | {"y_um": np.where(i > 300, np.nan, table["y_um"])}, "log"))
+    with pytest.raises(DataError, match="expected at least half"):
+        screen("log", runs, 60.0, needs_heat=False)
 
 
 def test_a_long_gap_is_said_once(tmp_path: Path) -> None:
