@@ -1,8 +1,9 @@
-"""What all logged channels could explain, and the remainder, in words: from the content of `diagnosis.json`."""
+"""What all logged channels could explain; this and the remainder in words, from the content of `diagnosis.json`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from compensator.diagnose.standing import held_by_the_base, is_hidden
@@ -12,11 +13,43 @@ from compensator.display import Words
 #: would act on, and no bound of statistics.
 SHORT_PCT = 80.0
 #: Channels that remove less than this share of the mean square explain next to nothing.
-_LITTLE = 0.1
+LITTLE = 0.1
 #: A remainder that leaves more than this share of the error removes nothing that shows in two digits.
 _MEASURABLE = 0.995
 #: Channels of the remainder that are named.
 _NAMED = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ceiling:
+    """What the best linear use of all logged channels leaves on data that took no part.
+
+    Parameters
+    ----------
+    rms_um : float
+        Its residual, µm.
+    explained_pct : float
+        How much of what it removes the named effects remove, %.
+    least_rms_um : float, optional
+        The smallest residual of this, the named effects, and these with the remainder, µm; None: it is `rms_um`.
+    """
+
+    rms_um: float
+    explained_pct: float
+    least_rms_um: float | None = None
+
+    def shows_something(self, before_um: float) -> bool:
+        """Return whether the channels remove more than next to nothing of a residual, µm rms."""
+        return bool(before_um > 0.0 and 1.0 - (self.rms_um / before_um) ** 2 >= LITTLE)
+
+    def is_missed(self, before_um: float) -> bool:
+        """Return whether the named effects explain clearly less of a residual than the channels can."""
+        return self.shows_something(before_um) and self.explained_pct < SHORT_PCT
+
+    @property
+    def least_um(self) -> float:
+        """The smallest residual of all that was tried, µm."""
+        return self.rms_um if self.least_rms_um is None else self.least_rms_um
 
 
 def named_rms(found: Mapping[str, Any]) -> float:
@@ -24,10 +57,9 @@ def named_rms(found: Mapping[str, Any]) -> float:
     return float((found.get("remainder") or {}).get("rms_before_um", found["after"]["rms_um"]))
 
 
-def _can_explain(found: Mapping[str, Any]) -> float:
-    """Return what share of the mean square on held-out data the channels remove."""
-    ceiling, before = found.get("ceiling"), found["before"]["rms_um"]
-    return 1.0 - (ceiling["rms_um"] / before) ** 2 if ceiling and before else 0.0
+def _ceiling_in(found: Mapping[str, Any]) -> Ceiling | None:
+    best = found.get("ceiling")
+    return Ceiling(rms_um=best["rms_um"], explained_pct=best["explained_pct"]) if best else None
 
 
 def explained(found: Mapping[str, Any]) -> str:
@@ -41,9 +73,10 @@ def explained(found: Mapping[str, Any]) -> str:
     >>> explained(found)
     'The named effects explain 83 % of what the channels can explain.'
     """
-    if _can_explain(found) < _LITTLE:
+    best = _ceiling_in(found)
+    if best is None or not best.shows_something(found["before"]["rms_um"]):
         return ""
-    share = found["ceiling"]["explained_pct"]
+    share = best.explained_pct
     if not found["effects"]:
         return "No named effect explains what the channels can explain."
     if share < 0.5 and held_by_the_base(found):
@@ -54,7 +87,8 @@ def explained(found: Mapping[str, Any]) -> str:
 
 def falls_short(found: Mapping[str, Any]) -> bool:
     """Whether the named effects explain clearly less than the channels can."""
-    return _can_explain(found) >= _LITTLE and bool(found["ceiling"]["explained_pct"] < SHORT_PCT)
+    best = _ceiling_in(found)
+    return best is not None and best.is_missed(found["before"]["rms_um"])
 
 
 def ceiling(found: Mapping[str, Any]) -> Words:

@@ -17,6 +17,7 @@ from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of
+from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
@@ -31,7 +32,7 @@ from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, warnings_of
+from compensator.diagnose.outcome import FOLDS, Diagnosis, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
@@ -157,6 +158,8 @@ def _diagnosed(
     verdict, is_explained = _verdict(
         found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None, is_off=is_off
     )
+    if verdict == "explained" and ceiling is not None and ceiling.is_missed(rms_of(held_out.nothing)):
+        verdict = "partly_explained"
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())

@@ -10,6 +10,7 @@ from typing import Literal
 from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice import Advice
+from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.found_effect import FoundEffect
@@ -52,28 +53,8 @@ class Remainder:
     confirmed: float = 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ceiling:
-    """What the best linear use of all logged channels leaves on data that took no part.
-
-    Parameters
-    ----------
-    rms_um : float
-        Its residual, µm.
-    explained_pct : float
-        How much of what it removes the named effects remove, %.
-    least_rms_um : float, optional
-        The smallest residual of this, the named effects, and these with the remainder, µm; None: it is `rms_um`.
-    """
-
-    rms_um: float
-    explained_pct: float
-    least_rms_um: float | None = None
-
-    @property
-    def least_um(self) -> float:
-        """The smallest residual of all that was tried, µm."""
-        return self.rms_um if self.least_rms_um is None else self.least_rms_um
+#: An error is said to be worse from this many times another one on.
+CLEARLY_WORSE = 1.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,7 +238,8 @@ def warnings_of(
     ):
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
-            text = f"What was found is clear in all data together, but predicts held-out blocks no better {numbers}."
+            worse = "no better" if rms_after <= CLEARLY_WORSE * rms_before else "worse"
+            text = f"What was found is clear in all data together, but predicts held-out blocks {worse} {numbers}."
             warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
         else:
             text = f"The effects increase the error on held-out blocks {numbers}, so the model was left unchanged."

@@ -13,12 +13,12 @@ from compensator.arrays import rms_of
 from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
-from compensator.diagnose.ceiling import ceiling, explained, falls_short, lowers, named_rms, remainder
+from compensator.diagnose.ceiling import Ceiling, ceiling, explained, falls_short, lowers, named_rms, remainder
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import free_run_sentence, off_zero
-from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
+from compensator.diagnose.outcome import Diagnosis, Remainder
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.standing import words as of_the_effects
 from compensator.display import Listing, Table, Words, warnings_of, with_std
@@ -263,7 +263,7 @@ def _words(found: Mapping[str, Any]) -> str:
         words = _NOT_FORETOLD
     elif said := of_the_effects(found):
         words = said
-    elif found["verdict"] == "explained" and falls_short(found):
+    elif found["verdict"] in ("explained", "partly_explained") and falls_short(found):
         words = _FALLS_SHORT
     elif _foretells_less(found):
         words = _FORETELLS_LESS
