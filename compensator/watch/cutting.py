@@ -81,7 +81,9 @@ def headline(
         found = Headline("care", "Cut with care", f"{found.text} {_ANSWER}")
     if found.cut == "no" or std_um is None:
         return found
-    return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")
+    # The deviation is that of the target; until the offset is there it is wrong by the rest of the way, too.
+    there = " once it has reached its target" if Reason.RATE_LIMITED in reasons else ""
+    return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation){there}.")
 
 
 def _headline(

@@ -54,6 +54,15 @@ def test_each_state_says_whether_one_may_cut(shown: str, reasons: tuple[str, ...
     assert found.cut == cut and words in found.text
 
 
+@pytest.mark.parametrize("reasons", [("implausible:model",), ("implausible:model", "rate_limited")])
+def test_the_deviation_of_an_offset_on_its_way_is_that_of_its_target(reasons: tuple[str, ...]) -> None:
+    found = headline(
+        shown="degraded", tone="warn", reasons=reasons, channels={}, until_ns=None, now_ns=NOW_NS, std_um=0.53
+    )
+    end = " once it has reached its target." if len(reasons) > 1 else "."
+    assert found.text.endswith(f"Offset ±0.5 µm (one standard deviation){end}")
+
+
 def test_a_start_says_once_that_there_is_no_zero() -> None:
     found = of("starting", "no_zero")
     assert found.text == f"No zero has been set yet. {State.STARTING.action}"
