@@ -275,6 +275,15 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
     )
     assert not again.answer["ok"] and "no candidate" in again.answer["text"]
     assert machine.store.in_use() == QUILL
+    # Nor after the loop has been off for some time.
+    on, (avoided,) = machine.config_bytes, last_state(machine).avoided
+    machine.use(on.replace(b'policy = "adopt"', b'policy = "off"'))
+    await machine.run(5)
+    assert "loop.json" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
+    machine.use(on)
+    await machine.run(5)
+    (kept,) = last_state(machine).avoided
+    assert kept.effects == EFFECT and abs(kept.until_utc_ns - avoided.until_utc_ns) <= 10 * 60 * NS
     checked(machine)
 
 
@@ -417,6 +426,7 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
     await machine.run(30)
     assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", ""), ("end", "failed")]
     assert "No space left on device" in machine.events("loop")[-1].text
+    assert "the present one stays, and it is compared no more" in machine.events("loop")[-1].text
     assert machine.store.in_use() == QUILL and machine.outcomes[-1].offset.model_sha256 == sha256_of(QUILL)
     # As if nothing had happened: the restart finds no model half stored, and the next night makes another candidate.
     await machine.run(1440, until=in_phase(machine, "shadow"))

@@ -384,7 +384,9 @@ class LiveLoop:
             # The way back stays open: the model is stored again with the next sample.
             log.error("the way back waits: %s", why)
             return
-        self._end_one(core, incoming.compensation.model.sha256, why)
+        self._end_one(
+            core, incoming.compensation.model.sha256, f"{why}; the present one stays, and it is compared no more"
+        )
 
     def _note(self, notes: list[Note] | tuple[Note, ...]) -> None:
         for note in notes:

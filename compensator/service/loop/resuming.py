@@ -1,8 +1,8 @@
 """The loop at the start of the service: continues from the end of the last recording.
 
 The last file is replayed with its own configuration and model, as the compensation is. After a kill between storing a
-model and the sample with it, the exchange is completed here. If a person has changed configuration or model, the shadow
-ends; what was adopted and gone back from stays known.
+model and the sample with it, the exchange is completed here. If a person has changed configuration or model, or the
+loop has been off, the shadow ends; what was gone back from or dismissed stays known.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from compensator.clock import HOUR_NS
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError
 from compensator.events import Note
 from compensator.recording.container import Container
+from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, ModelLoop
@@ -37,6 +39,8 @@ class _Replayed:
     compensation: Compensation
     config: bytes
     model: bytes
+    #: Whether it is the very last recording; otherwise the loop has been off since then.
+    is_last: bool
 
 
 def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ModelLoop | None:
@@ -69,7 +73,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
         core.state.base_effects = list(calibrated)
         return core
     core = last.loop.core
-    if last.config == loaded.data:
+    if last.config == loaded.data and last.is_last:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()
             return core
@@ -90,13 +94,20 @@ def _complete(resumed: Resumed, last: _Replayed) -> list[Note]:
 
 
 def _replayed(config: Config, folder: Path) -> _Replayed | None:
-    """Replay the last recording, if it has a loop."""
-    for path in reversed(recordings(folder, config.machine.name)):
+    """Replay the last recording with a loop, unless that is so old that nothing it knew counts any longer."""
+    machine, is_last = config.machine.name, True
+    paths = recordings(folder, machine)
+    assert config.loop is not None
+    oldest_ns = began_ns(paths[-1], machine) - config.loop.watch_h * HOUR_NS if paths else 0
+    for path in reversed(paths):
+        if began_ns(path, machine) < oldest_ns:
+            return None
         opening = opening_of(path)
         if "state.json" not in opening:
             continue
         if LOOP_STATE not in opening:
-            return None
+            is_last = False
+            continue
         with Container(path) as container:
             contents = container.survey(whole=False)
             compensation = Compensation(*setup_of(contents, path.name))
@@ -108,5 +119,5 @@ def _replayed(config: Config, folder: Path) -> _Replayed | None:
                 outcome = apply(compensation, step)
                 if isinstance(outcome, Outcome):
                     loop.process(outcome)
-        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"])
+        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"], is_last)
     return None
