@@ -689,6 +689,11 @@ class ServiceWarning(Code):
         "Certificates are not checked, so an expired one is noticed only when the router refuses it.",
         "Install the extra that reads them: pip install quill-compensator[tls].",
     )
+    LOOP_WITHOUT_CHECK = (
+        "loop_without_check",
+        "Measured and predicted Y are not compared sample by sample, so nothing but the clock begins a diagnosis.",
+        "Set plausibility.false_alarm_days, such as 30: what has begun or ended is then answered sooner.",
+    )
     PROBE_TOLERANCE = (
         "probe_tolerance",
         "The tolerance for probes is smaller than the standard deviation of one of them: one is wanted nearly always.",

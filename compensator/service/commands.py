@@ -22,7 +22,7 @@ from compensator.service.probing.received import ProbeRefused, unused_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, longest, refusal
 from compensator.service.replay import execute
 from compensator.service.transfer.adoption import Adoption, ModelRequest
-from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.second_opinion import described, without_move
 
 #: Largest number of commands that wait for the next sample. A `hold` has one more place: it stops the offset.
 WAITING_COMMANDS = 100
@@ -174,8 +174,10 @@ class Commands:
             return
         self._is_answered = True
         self._enqueue(name, {"candidate": True, "force": request.force, "sha256": offer.sha256}, sender)
-        done = "is adopted" if name == CommandName.ADOPT else "is dismissed"
-        text = f"candidate {offer.named} {done}; {described(offer.comparison)}; acts at the next sample"
+        is_adopted = name == CommandName.ADOPT
+        compared = described(offer.comparison if is_adopted else without_move(offer.comparison))
+        done = "is adopted" if is_adopted else "is dismissed"
+        text = f"candidate {offer.named} {done}; {compared}; acts at the next sample"
         figures = {"model_sha256": offer.sha256, "comparison": offer.comparison.table()}
         reply.set_result({"ok": True, "text": text} | figures)
 

@@ -92,7 +92,11 @@ class Setup:
         zenoh = self.config.zenoh
         found = [remark for line in self.config.line if (remark := _numbered_port(line)) is not None]
         found += _exposures(zenoh)
-        probe = self.config.probe
+        probe, loop, checks = self.config.probe, self.config.loop, self.config.plausibility
+        is_checked = probe is not None or (checks is not None and checks.false_alarm_days is not None)
+        if loop is not None and loop.is_on and not is_checked:
+            figures = f"loop.misfit_h = {loop.misfit_h:g} has no effect: plausibility.false_alarm_days is not given."
+            found.append(Remark(ServiceWarning.LOOP_WITHOUT_CHECK, figures))
         if probe is not None and probe.tolerance_um is not None and probe.tolerance_um < probe.std_um:
             figures = (
                 f"probe.tolerance_um = {probe.tolerance_um:g} is below probe.std_um = {probe.std_um:g}: a probe is "

@@ -41,7 +41,7 @@ _DO: Mapping[str, str] = {
     EventKind.RECORDING: "Check free space, permissions and the disk.",
     EventKind.CLOCK: "Check the time service of the machine's computer.",
     EventKind.ERROR: "Report it with its text; the offset is held until the error is gone.",
-    EventKind.COMMAND_REFUSED: "Find out who sent it and with what permission; the offset did not change.",
+    EventKind.COMMAND_REFUSED: "See the reason; if nobody here sent it, find out who did. The offset did not change.",
     EventKind.ADOPT: "The previous model remains active; the text states why the new one was refused.",
     EventKind.RESTART: "Nothing, if the standard deviation is small enough for the work.",
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from compensator.api import shop
 from compensator.cli import main
+from compensator.demo.machine import configuration
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.run import Diagnosed
@@ -26,6 +28,17 @@ TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
     (60, "loop", "begins", LoopData(step=LoopAction.SHADOW, effects=["gain:DTF"], role="candidate").table()),
     (300, "loop", "proposed", PROPOSED.table()),
 )
+
+
+@pytest.mark.parametrize(("checks", "is_warned"), [("", True), ("[plausibility]\nfalse_alarm_days = 30.0\n", False)])
+def test_a_loop_that_nothing_but_the_clock_sets_going_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], checks: str, is_warned: bool
+) -> None:
+    lines = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 1, "command": 2}
+    text = re.sub(r"\[plausibility\].*?(?=\n\[|\Z)", "", configuration("vmc-07", lines, 7447), flags=re.S)
+    (tmp_path / "machine.toml").write_text(text + LOOP.decode() + checks, encoding="utf-8")
+    assert main(["check", "--config", str(tmp_path / "machine.toml")]) == 0
+    assert ("[loop_without_check]" in capsys.readouterr().err) is is_warned
 
 
 def recorded(
