@@ -73,7 +73,8 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
     numbered = [(row, cells) for row, cells in enumerate(lines[1:], start=first) if cells]
     for row, line in numbered:
         if len(line) != len(header):
-            raise DataError(f"{path}: row {row}: {len(line)} cells, expected {len(header)}")
+            taken = f", as in its first line, {header[0][:40]!r}: is that the header?" if len(header) == 1 else ""
+            raise DataError(f"{path}: row {row}: {len(line)} cells, expected {len(header)}{taken}")
     columns = zip(*(line for _, line in numbered), strict=True) if numbered else ([] for _ in header)
     # Keep cells as text: numpy would truncate or convert them.
     arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
