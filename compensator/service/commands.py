@@ -32,6 +32,8 @@ WAITING_PROBES = 20
 REFUSED_PROBES = 20
 #: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
+#: Fewest digits of a hash that name a candidate.
+FEWEST_DIGITS = 6
 #: Commands whose arguments are a `ModelRequest`.
 _ABOUT_MODELS = (CommandName.ADOPT, CommandName.BACK, CommandName.DISMISS)
 #: Longest part of a mode that a refusal repeats, characters.
@@ -160,6 +162,8 @@ class Commands:
                 )
             if self._loop is None:
                 raise ServiceError("the service is ending")
+            if 0 < len(request.sha256) < FEWEST_DIGITS:
+                raise ServiceError(f"sha256 = {request.sha256!r}, expected at least {FEWEST_DIGITS} digits of a hash")
             if self._is_answered:
                 raise ServiceError("the candidate was answered already, which acts at the next sample")
             if self._adoption.is_under_way:

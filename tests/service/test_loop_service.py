@@ -254,6 +254,7 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
     # It is not proposed: who answers has read of another one.
     late = machine.at_sample[EVENING + 50] = Asked(machine, "dismiss")
     other = machine.at_sample[EVENING + 55] = Asked(machine, "dismiss", sha256="0" * 12)
+    short = machine.at_sample[EVENING + 56] = Asked(machine, "dismiss", sha256=sha256_of(extended())[:3])
     no = Asked(machine, "dismiss", sha256=sha256_of(extended())[:12])
     back = Asked(machine, "back")
 
@@ -265,6 +266,7 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
     await machine.run(1440 + EVENING + 60)
     assert not late.answer["ok"] and "compensator dismiss HASH" in late.answer["text"], late.answer
     assert not other.answer["ok"] and "candidate 000000000000 has given its place" in other.answer["text"]
+    assert not short.answer["ok"] and "expected at least 6 digits of a hash" in short.answer["text"]
     assert no.answer["ok"], no.answer
     # What has been answered is not lost by another change of the model within the minute.
     assert not back.answer["ok"] and "the candidate was answered" in back.answer["text"], back.answer
@@ -276,13 +278,14 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
     assert not again.answer["ok"] and "no candidate" in again.answer["text"]
     assert machine.store.in_use() == QUILL
     # Nor after the loop has been off for some time.
-    on, (avoided,) = machine.config_bytes, last_state(machine).avoided
+    on, (avoided,), zero_ns = machine.config_bytes, last_state(machine).avoided, last_state(machine).zero_utc_ns
     machine.use(on.replace(b'policy = "adopt"', b'policy = "off"'))
-    await machine.run(5)
+    await machine.run(60)
     assert "loop.json" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
     machine.use(on)
     await machine.run(5)
     (kept,) = last_state(machine).avoided
+    assert last_state(machine).zero_utc_ns == zero_ns > 0
     assert kept.effects == EFFECT and abs(kept.until_utc_ns - avoided.until_utc_ns) <= 10 * 60 * NS
     checked(machine)
 

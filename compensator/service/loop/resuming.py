@@ -81,6 +81,8 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
             resumed.notes += _complete(resumed, last)
             return core
     effects, now_ns = effect_names(present.model), present.status.time_utc_ns
+    if not last.is_last:
+        core.state.time_utc_ns = now_ns  # no clock was set while it was off
     resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated)
     core.drop_ended()
     return ModelLoop(config, present.model, core.attachments())
