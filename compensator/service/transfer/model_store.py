@@ -149,7 +149,7 @@ class ModelStore:
         if contents.machine not in (UNSET, self._machine):
             raise ServiceError(
                 f"{path}: of machine {contents.machine}, expected {self._machine}: each machine needs a "
-                "recording.folder of its own"
+                "folder of its own (recording.folder, or model.store)"
             )
         contents.machine = self._machine
         if contents.configured_sha256 != self._configured_sha256:
