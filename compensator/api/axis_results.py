@@ -12,6 +12,7 @@ from compensator.display import Listing, Shown, Table, Words
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
+    from compensator.api.plotting import Plot
     from compensator.report.page import Page
 
 _Result = TypeVar("_Result", bound=Any)
@@ -45,6 +46,15 @@ class AxisResults(Shown, Mapping[str, _Result], Generic[_Result]):
     def contents(self) -> Sequence[str | Table | Words | Listing]:
         """Return the content of each axis below its name."""
         return [part for axis, result in self.results.items() for part in (_heading(axis), *result.contents())]
+
+    def plot(self) -> Plot:
+        """Plot what the result of each axis plots, one below another."""
+        from compensator.api.plotting import stacked
+
+        found = [(label_of(axis), panel) for axis, result in self.results.items() for panel in result.panels()]
+        return stacked(
+            (label if label.startswith(name) else f"{name} {label}", curves) for name, (label, curves) in found
+        )[0]
 
 
 def _heading(axis: str) -> str:

@@ -28,7 +28,7 @@ from compensator.model.simulation import Scores
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Plot
+    from compensator.api.plotting import Panel, Plot
     from compensator.report.page import Page
 
 
@@ -172,10 +172,14 @@ class ComparisonResult(Paged):
         """Plot measured and predicted deformation, and the error of each model, over time."""
         from compensator.api.plotting import stacked
 
+        return stacked(self.panels())[0]
+
+    def panels(self) -> list[Panel]:
+        """Return the curves of the plot."""
         curves = [("measured", self.t_h, self.y_um)]
         curves += [(name, self.t_h, values) for name, values in self.predictions.items()]
         residuals = [(name, self.t_h, values) for name, values in self.residuals.items()]
-        return stacked([(self.words("Y, µm"), curves), ("measured − predicted, µm", residuals)])[0]
+        return [(self.words("Y, µm"), curves), ("measured − predicted, µm", residuals)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)

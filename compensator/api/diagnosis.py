@@ -52,7 +52,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Plot
+    from compensator.api.plotting import Panel, Plot
     from compensator.report.page import Page
 
 #: Files that `save` writes into a folder.
@@ -180,10 +180,14 @@ class DiagnosisResult(_DiagnosisFiles):
         """Plot the residual before and after on held-out data, one run after another."""
         from compensator.api.plotting import stacked
 
+        return stacked(self.panels())[0]
+
+    def panels(self) -> list[Panel]:
+        """Return the curves of the plot."""
         found = self.diagnosis
         hours: Vector = np.arange(found.held_out_before.size, dtype=np.float64) * found.model.period_s / 3600.0
         before, after = ("before", hours, found.held_out_before), ("after", hours, found.held_out_after)
-        return stacked([("residual on held-out blocks, µm", [before, after])])[0]
+        return [("residual on held-out blocks, µm", [before, after])]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)

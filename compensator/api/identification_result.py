@@ -24,7 +24,7 @@ from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Plot
+    from compensator.api.plotting import Panel, Plot
     from compensator.report.page import Page
 
 
@@ -122,11 +122,14 @@ class IdentificationResult(Paged):
         """Plot measured and predicted deformation, and the residual; held-out parts are shaded."""
         from compensator.api.plotting import stacked
 
-        hours, y, predicted, held_out = joined(self.calibration.parts)
-        curves = [("measured", hours, y), ("predicted, free run", hours, predicted)]
-        residual = [("measured − predicted", hours, y - predicted)]
-        figure, axes = stacked([(self.words("Y, µm"), curves), ("residual, µm", residual)])
+        figure, axes = stacked(self.panels())
         for axis in axes:
-            for first, last in held_out:
+            for first, last in joined(self.calibration.parts)[3]:
                 axis.axvspan(first, last, color="0.9")
         return figure
+
+    def panels(self) -> list[Panel]:
+        """Return the curves of the plot."""
+        hours, y, predicted, _ = joined(self.calibration.parts)
+        curves = [("measured", hours, y), ("predicted, free run", hours, predicted)]
+        return [(self.words("Y, µm"), curves), ("residual, µm", [("measured − predicted", hours, y - predicted)])]

@@ -12,6 +12,8 @@ from compensator.arrays import Vector
 
 #: A label and the times, h, and values of a line.
 Curve = tuple[str, Vector, Vector]
+#: Label of the values, and the curves, of a panel.
+Panel = tuple[str, list[Curve]]
 
 
 class Plot(Figure):

@@ -18,7 +18,7 @@ from compensator.model.free_run import NOTHING, in_words, table_of_scores
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Plot
+    from compensator.api.plotting import Panel, Plot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -107,14 +107,18 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         """Plot measured and predicted deformation, and the residual."""
         from compensator.api.plotting import stacked
 
+        return stacked(self.panels())[0]
+
+    def panels(self) -> list[Panel]:
+        """Return the curves of the plot."""
         hours = self["t_s"] / 3600.0
         words = self.words
         curves = [("predicted", hours, self[words("y_pred_um")])]
         if self.scores is None:
-            return stacked([(words("Y, µm"), curves)])[0]
+            return [(words("Y, µm"), curves)]
         curves.insert(0, ("measured", hours, self[words("y_um")]))
         residual = [("measured − predicted", hours, self[words("residual_um")])]
-        return stacked([(words("Y, µm"), curves), ("residual, µm", residual)])[0]
+        return [(words("Y, µm"), curves), ("residual, µm", residual)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)

@@ -123,6 +123,11 @@ def test_what_is_said_names_the_axis(found, tmp_path):
         tc.identify(whole | {"z_um": np.zeros(whole["t_s"].size)}, axis="z")
 
 
+def test_a_plot_has_the_panels_of_every_axis(found):
+    labels = [panel.get_ylabel() for panel in found.plot().axes]
+    assert labels == [label for one in ("X", "Y", "Z") for label in (f"{one}, µm", f"{one} residual, µm")]
+
+
 @pytest.mark.usefixtures("without_pictures")
 def test_the_summary_has_a_column_for_each_axis(found, tmp_path):
     text = found.summary()
