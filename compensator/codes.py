@@ -616,7 +616,7 @@ class DataRemark(Code):
     )
     COLUMN_COUNTS = (
         "column_counts",
-        "A channel takes many values and never falls: a count or a clock, not a cause; it is left out.",
+        "A channel takes many values, rises steadily and never falls: it is taken for a count, and left out.",
         "If what it counts may act, log its rate: a speed, a power, parts an hour.",
     )
     FOLLOWS_Y = (

@@ -83,10 +83,11 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     present[slot] = True
     records = []
     start = 0
-    usual = round(_spacing(t_s) / period_s) - 1 if t_s.size > 1 else 0
+    apart_s = _spacing(t_s) if t_s.size > 1 else 0.0
+    usual = math.ceil(apart_s / period_s - 0.01) - 1
     gaps = [(first, last) for first, last in _gaps(present) if last - first > usual]
     if usual > 0:
-        words = f"{table.name}: its rows are {usual + 1} samples of {period_s:g} s apart; bridged."
+        words = f"{table.name}: its rows are {apart_s:.0f} s apart, samples {period_s:g} s; bridged."
         remarks.append(Remark(DataRemark.ROWS_APART, words))
     remarks += _bridged(table.name, [one for one in gaps if one[1] - one[0] <= SHORT_GAP_SAMPLES], period_s)
     for first, last in gaps:

@@ -24,8 +24,12 @@ QUIET, SHARP = 3.0, 0.3
 #: A channel is Y times a constant where it differs from it by so many times the noise of both, and moves by so many.
 ALIKE, MOVES = 2.0, 30.0
 #: Two columns with at least so many values each are the same measurement where one is the other times a constant to
-#: within half a digit of both; what takes as many and never falls is a count.
+#: within half a digit of both; what takes as many and only ever rises may be a count.
 DISTINCT, SAME = 20, 1e-9
+#: A count differs from a straight line over time by no more than this share of its span, standard deviation.
+STEADY = 0.05
+#: Units of what rises by itself or is commanded, and is no count.
+_NO_COUNTS = (DEGC, "_k", "_rpm", "_pct", "_w", "_kw", "_lpm", "_bar", "_a", "_v", "_hz")
 #: Values are the same to so many digits after the point: T_Q is stored as its difference from AT.
 _DIGITS = 9
 
@@ -55,8 +59,8 @@ def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
             if other != channel:
                 words = f"{name}: {channel} has the values of {other} in every row; {other} alone is searched."
                 found[channel] = Remark(DataRemark.COLUMN_COPY, words)
-            elif counts(parts, is_temperature=channel.endswith(DEGC)):
-                words = f"{name}: {channel} never falls: a count or a clock, not a cause; log its rate."
+            elif counts(channel, parts):
+                words = f"{name}: {channel} rises steadily and never falls: taken for a count; log its rate."
                 found[channel] = Remark(DataRemark.COLUMN_COUNTS, words)
             elif measures_y(parts, y, is_temperature=channel.endswith(DEGC)):
                 words = f"{name}: {channel} follows y_um without delay: a second measurement of Y, not a cause."
@@ -64,14 +68,21 @@ def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
     return found
 
 
-def counts(channel: Sequence[Vector], *, is_temperature: bool) -> bool:
-    """Whether a channel counts something, such as rows, parts, hours or energy: it takes many values and never falls.
+def counts(name: str, channel: Sequence[Vector]) -> bool:
+    """Whether a channel seems to count something, such as rows, parts, hours or energy.
 
-    What it says is how late it is, and a drift of Y that is called by its name goes on for ever. A temperature may rise
-    all the time that a record lasts.
+    It takes many values, never falls and rises steadily: what it says is how late it is, and a drift of Y that is
+    called by its name goes on for ever. A temperature may do so as long as a record lasts, and what is commanded too.
     """
-    rises = all(np.all(np.diff(part) >= 0.0) for part in channel)
-    return not is_temperature and rises and np.unique(np.concatenate(list(channel))).size >= DISTINCT
+    if name.endswith(_NO_COUNTS) or np.unique(np.concatenate(list(channel))).size < DISTINCT:
+        return False
+
+    def is_steady(part: Vector) -> bool:
+        times = np.arange(part.size)
+        left = part - np.polyval(np.polyfit(times, part, 1), times)
+        return bool(np.all(np.diff(part) >= 0.0)) and float(np.std(left)) <= STEADY * float(np.ptp(part))
+
+    return all(is_steady(part) for part in channel if part.size > 1)
 
 
 def measures_y(channel: Sequence[Vector], y: Sequence[Vector], *, is_temperature: bool) -> bool:

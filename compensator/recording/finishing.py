@@ -5,6 +5,7 @@ All of this runs on a separate thread that yields to samples.
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 from collections import deque
@@ -35,6 +36,8 @@ log = logging.getLogger("compensator")
 _DAY_NS = 86_400 * NS
 #: A clock that is this much later than the recording before, days, is believed once it has gone on for as long.
 CONFIRMED_DAYS = 7
+#: So many such jumps are left out: more are a machine that is used now and then.
+MOST_JUMPS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,10 +152,10 @@ class Finisher:
                 path, now_ns = self._jobs.popleft()
             error = self._compacted(path) if path is not None else None
             # Also if the disk is too full for the copy: the removal makes room for it.
-            needs_room = path is None or isinstance(error, OSError)
-            if self._remove_oldest(now_ns, needs_room=needs_room) and path is not None and needs_room:
+            needs_room = path is None or is_full(error)
+            if self._remove_oldest(now_ns, needs_room=needs_room) and path is not None and isinstance(error, OSError):
                 error = self._compacted(path)
-                self._remove_oldest(now_ns, needs_room=error is not None)
+                self._remove_oldest(now_ns, needs_room=is_full(error))
             if error is not None and path is not None and path.exists():
                 text = f"{path.name}: could not be compacted and remains unchanged: {error}"
                 self.remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
@@ -222,7 +225,7 @@ class Finisher:
 
 
 def confirmed_ns(began: Sequence[int], now_ns: int) -> int:
-    """Return the time by which recordings are old: now, or of one a day after those that a jump of the clock follows.
+    """Return the time by which recordings are old: now, or a day after the last one before an unconfirmed jump.
 
     Parameters
     ----------
@@ -236,15 +239,25 @@ def confirmed_ns(began: Sequence[int], now_ns: int) -> int:
     >>> day = 86_400 * 10**9
     >>> [confirmed_ns([1 * day, 2 * day, 900 * day], now * day) // day for now in (900, 906, 907)]
     [3, 3, 907]
+
+    A machine that is used each tenth day: no time is ever confirmed, and the last jumps are left out.
+
+    >>> confirmed_ns([10 * i * day for i in range(40)], 390 * day) // day
+    361
     """
     begins, limit_ns = sorted(began), CONFIRMED_DAYS * _DAY_NS
-    end_ns = now_ns
+    end_ns, jumps = now_ns, 0
     for before, after in zip(reversed(begins[:-1]), reversed(begins[1:]), strict=True):
-        if end_ns - after >= limit_ns:
+        if end_ns - after >= limit_ns or jumps == MOST_JUMPS:
             break
         if after - before >= limit_ns:
-            end_ns = before + _DAY_NS
+            end_ns, jumps = before + _DAY_NS, jumps + 1
     return min(end_ns, now_ns)
+
+
+def is_full(error: BaseException | None) -> bool:
+    """Return whether an error says that the disk is full."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def compact(

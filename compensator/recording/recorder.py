@@ -21,7 +21,7 @@ from compensator.atomic_write import sync_folder
 from compensator.events import RecordingCode, RecordingData
 from compensator.recording import chain
 from compensator.recording.container import Attachment
-from compensator.recording.finishing import Finisher, Retention
+from compensator.recording.finishing import Finisher, Retention, is_full
 from compensator.recording.head import HeadKeeper, previous_end
 from compensator.recording.live_file import TOPICS, RecordingFile
 from compensator.recording.naming import day_of, names, order_of
@@ -147,7 +147,7 @@ class McapRecorder:
                 self._live.sync()
         except BaseException as error:
             self._give_up()
-            if isinstance(error, OSError):
+            if is_full(error):
                 self._finisher.make_room(time_utc_ns)
             raise
 

@@ -50,7 +50,7 @@ def test_a_sparse_temperature_is_said_with_its_share(tmp_path: Path, every: int,
 def test_rows_that_are_further_apart_than_the_samples_are_said_once_and_real_gaps_beside(tmp_path: Path) -> None:
     found = remarks(tmp_path / "a.csv", [row(i) for i in range(0, 3 * ROWS, 3) if not 300 <= i < 330])
     assert [one.code for one in found] == ["rows_apart", "gap_bridged"]
-    assert "its rows are 3 samples of 60 s apart" in found[0] and "gap of 32 sample(s) from t_s = 17880" in found[1]
+    assert "its rows are 180 s apart, samples 60 s" in found[0] and "gap of 32 sample(s) from t_s = 17880" in found[1]
 
 
 def test_many_gaps_are_said_in_one_remark(tmp_path: Path) -> None:

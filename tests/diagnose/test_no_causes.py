@@ -59,6 +59,8 @@ def test_a_count_is_no_cause_and_a_temperature_that_rises_may_be_one():
         row=lambda table, rng: np.arange(N, dtype=float),
         parts=lambda table, rng: np.floor(np.arange(N) / 13.0),
         energy_kwh=lambda table, rng: np.cumsum(rng.random(N) * (np.arange(N) // 60 % 2)),
+        stairs_rpm=lambda table, rng: 200.0 * (np.arange(N) // 40),
+        humidity=lambda table, rng: 40.0 + 20.0 * (1.0 - np.exp(-np.arange(N) / 200.0)),
         floor_degc=lambda table, rng: 20.0 + np.arange(N) / 500.0,
         switched=lambda table, rng: 1.0 * (np.arange(N) > 300),
         ramp_rpm=lambda table, rng: np.abs(np.arange(N) - 700.0),

@@ -56,8 +56,7 @@ def test_a_weekend_is_no_time_in_which_a_candidate_was_compared() -> None:
     assert all(seq >= FIRST + 300 + 3600 + 12 * 60 for seq in adopted)
 
 
-@pytest.mark.parametrize("days", [-30, 30])
-def test_a_clock_that_is_wrong_by_a_month_ends_nothing_that_waits(days: int) -> None:
+def test_a_clock_that_is_behind_by_a_month_ends_nothing_that_waits() -> None:
     """A flat battery: the service starts with a wrong time, which is set right some minutes later."""
     loop = LoopRun(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
     source = machine(FIRST + 1500)
@@ -65,8 +64,8 @@ def test_a_clock_that_is_wrong_by_a_month_ends_nothing_that_waits(days: int) -> 
     now_ns = run(loop, source, 1)[0].outcome.sample.time_utc_ns
     avoid(loop._core.state, ["gain:DTF"], now_ns, 168.0)
     assert loop.phase == "proposed"
-    loop.pause(None if days < 0 else days * 1440 - 1)
-    steps = run(loop, (moved(one, 24.0 * days) for one in source), 6)
+    loop.pause(None)
+    steps = run(loop, (moved(one, -24.0 * 30) for one in source), 6)
     steps += run(loop, source, 200)
     assert loop.phase == "proposed" and decisions(steps) == []
     now_ns = steps[-1].outcome.sample.time_utc_ns

@@ -90,7 +90,7 @@ class Loop:
         return Compared(place, self._settings, self._period_s, state.error, alike=max(alike, 1), y_drifted=has_drifted)
 
     def pause(self, samples: int | None) -> None:
-        """Account for samples that were not measured; None: nobody knows how many, and for how long does not count."""
+        """Account for samples that were not measured; None: it is not known how many, and they count as none."""
         self.state.missing += samples or 0
 
     # ------------------------------------------------------------------ one sample
@@ -289,7 +289,7 @@ class Loop:
             state.diagnosis = None
             return [nothing_follows("in_shadow", found)]
         is_another = before is None and role_of(found) == "candidate"
-        last = gives_way(state, self._settings, running.to_utc_ns) if is_another else None
+        last = gives_way(state, self._settings, state.time_utc_ns or running.to_utc_ns) if is_another else None
         notes = end(self.state, last, "gives_way") if last is not None else []
         state.diagnosis = msgspec.structs.replace(running, is_next=True)
         return [*notes, begins(found)]

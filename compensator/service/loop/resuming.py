@@ -73,6 +73,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
         core.state.base_effects = list(calibrated)
         return core
     core = last.loop.core
+    core.state.missing = 0  # how long the service has been away is known from the last sample on
     if last.config == loaded.data and last.is_last:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()
@@ -82,7 +83,8 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
             return core
     effects, now_ns = effect_names(present.model), present.status.time_utc_ns
     if not last.is_last:
-        core.state.time_utc_ns = now_ns  # no clock was set while it was off
+        # No clock was set while it was off, and nothing that it counts went on.
+        core.state.time_utc_ns, core.state.misfit_min, core.state.usable_min = now_ns, 0.0, 0.0
     resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated)
     core.drop_ended()
     return ModelLoop(config, present.model, core.attachments())

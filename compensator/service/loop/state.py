@@ -232,9 +232,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def follow_clock(self, now_ns: int, period_ns: int, record_ns: int) -> None:
         """Go on at the time of a sample: where the clock was set since the last one, every time moves with it.
 
-        So what has lasted for some hours has lasted as long after it. Of what waits for a person, or may be gone back
-        from, the time off does not count either. Where no more than a moment of the record is left to be diagnosed,
-        the next planned time is waited for.
+        So what has lasted for some hours has lasted as long after it. Where nothing is left of the record that is
+        diagnosed, by that or after a long time off, what the model has erred by is forgotten, and the next planned time
+        is waited for.
 
         Parameters
         ----------
@@ -248,9 +248,6 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         set_ns = now_ns - last_ns - off_ns - period_ns if last_ns else 0
         if abs(set_ns) >= period_ns:
             self._move_clock(set_ns)
-        else:
-            set_ns = 0
-        self._move_terms(set_ns + off_ns)
         if max(abs(set_ns), off_ns) >= record_ns:
             self.planned_utc_ns, self.usable_min, self.misfit_min = 0, 0.0, 0.0
 
@@ -260,17 +257,14 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         self.zero_utc_ns = moved(self.zero_utc_ns, by_ns)
         self.y_drifted_ns = moved(self.y_drifted_ns, by_ns)
         self.uncompared_ns = moved(self.uncompared_ns, by_ns)
+        self.adopted_utc_ns = moved(self.adopted_utc_ns, by_ns)
         self.probes_shown = [(at_ns + by_ns, shown) for at_ns, shown in self.probes_shown]
         self.error.move_clock(by_ns)
         for place in self.taken:
+            place.since_utc_ns = moved(place.since_utc_ns, by_ns)
             place.level_utc_ns = moved(place.level_utc_ns, by_ns)
             place.comparison.move_clock(by_ns)
             place.error.move_clock(by_ns)
-
-    def _move_terms(self, by_ns: int) -> None:
-        self.adopted_utc_ns = moved(self.adopted_utc_ns, by_ns)
-        for place in self.taken:
-            place.since_utc_ns = moved(place.since_utc_ns, by_ns)
         self.avoided = [
             msgspec.structs.replace(one, until_utc_ns=moved(one.until_utc_ns, by_ns)) for one in self.avoided
         ]
