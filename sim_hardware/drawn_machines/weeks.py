@@ -328,4 +328,24 @@ SEALED_WEEKS = _weeks(880_000, 100)
 SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = (
     ((880_000, 880_025, 880_050, 880_075), "2026-11-23, proposals stay; tests/bench/README.md, The loop"),
     ((880_001, 880_026, 880_051, 880_076), "2026-11-24, three candidates at once; tests/bench/README.md, The loop"),
+    (
+        (
+            *(
+                880_002,
+                880_027,
+                880_052,
+                880_077,
+                880_003,
+                880_028,
+                880_053,
+                880_078,
+                880_004,
+                880_029,
+                880_054,
+                880_079,
+            ),
+            *(880_006, 880_031, 880_056, 880_081, 880_008, 880_033, 880_058),
+        ),
+        "2026-11-28, what has ended is left out; tests/bench/README.md, The loop",
+    ),
 )
