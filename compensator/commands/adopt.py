@@ -41,7 +41,6 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.ADOPT, wanted, setup, arguments)
     if reply is not None:
         return answered(reply, service_reached=True)
-    _refuse_beside_a_service(setup, force=arguments.force)
     if model.sha256 == setup.model.sha256:
         raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
@@ -66,7 +65,6 @@ def back(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.BACK, {"force": arguments.force}, setup, arguments)
     if reply is not None:
         return answered(reply, service_reached=True)
-    _refuse_beside_a_service(setup, force=arguments.force)
     model = check_model(setup.config, setup.store.before(), source="previous model")
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
@@ -92,11 +90,12 @@ def _decide(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse
 
 
 def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Send a command to the running service; return None if there is none."""
+    """Send a command to the running service; return None if there is none, or its next start is meant by force."""
     payload, operator = json.dumps(wanted).encode(), operator_of(arguments)
     try:
         return ask(setup.config.zenoh, name, payload, timeout_s=arguments.timeout, operator=operator)
     except NotReached:
+        _refuse_beside_a_service(setup, force=arguments.force)
         return None
 
 

@@ -176,14 +176,14 @@ def table_of(
     rows = range(size) if rows is None else rows
     numbers: dict[str, Vector] = {}
     remarks: list[Remark] = []
-    for column, values in arrays.items():
+    for number, (column, values) in enumerate(arrays.items(), start=1):
         if values.size != size:
             raise DataError(f"{name}: {column} has {values.size} values, {time_column} {size}, expected equally many")
         if column in (time_column, *TIMES):
             continue
         is_needed = column in DATA_ROLES or column in (roles or {}).values()
         if not (is_needed or (column.strip() and column.isprintable())):
-            remarks += _unnamed(name, list(arrays).index(column) + 1, values)
+            remarks += _unnamed(name, number, values)
             continue
         converted, left_out = _numbers(name, column, values, rows, is_needed=is_needed)
         if converted is not None:
