@@ -99,7 +99,7 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     authorities = _read(source, files.names[0], files.ca, x509.load_pem_x509_certificates)
     own = _read(source, files.names[1], files.certificate, x509.load_pem_x509_certificates)
     key = _read(source, files.names[2], files.key, lambda data: load_pem_private_key(data, None))
-    if own[0].public_key() != key.public_key():
+    if _read(source, files.names[1], files.certificate, _public_key) != key.public_key():
         raise ConfigError(f"{source}: {files.names[2]} = {str(files.key)!r}: not the key of {files.certificate}")
     if len(own) == 1 and not any(_issued(own[0], authority) for authority in authorities):
         raise ConfigError(
@@ -138,23 +138,31 @@ def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Rem
     return [Remark(ServiceWarning.CERTIFICATE_ENDS, figures)]
 
 
+def _public_key(data: bytes) -> Any:
+    from cryptography import x509
+
+    return x509.load_pem_x509_certificates(data)[0].public_key()
+
+
 def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:
+    from cryptography.exceptions import UnsupportedAlgorithm
+
     try:
         return load(read_file(path, KEY_BYTES))
     except OSError as error:
         raise ConfigError(f"{source}: {name} = {str(path)!r}: {error.strerror or error}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise ConfigError(
             f"{source}: {name} = {str(path)!r}: not a PEM file of this kind without a password"
         ) from error
 
 
 def _issued(certificate: Any, authority: Any) -> bool:
-    from cryptography.exceptions import InvalidSignature
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 
     try:
         certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
+    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
         return False
     return True
 

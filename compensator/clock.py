@@ -32,13 +32,17 @@ class Clock(Protocol):
         """Return the wall clock, ns since 1970 UTC. It may be set back or forward."""
 
     def monotonic_ns(self) -> int:
-        """Return a monotonic clock, ns."""
+        """Return a monotonic clock, ns, which goes on while the computer sleeps."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait."""
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
         """Wait until the tasks are done, or for a while; the tasks continue."""
+
+
+#: Goes on while the computer sleeps, which the usual monotonic clock of Linux does not.
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 
 class SystemClock:
@@ -49,8 +53,8 @@ class SystemClock:
         return time.time_ns()
 
     def monotonic_ns(self) -> int:
-        """Return the monotonic clock, ns."""
-        return time.monotonic_ns()
+        """Return the monotonic clock, ns; it goes on while the computer sleeps."""
+        return time.clock_gettime_ns(_CLOCK)
 
     async def sleep(self, seconds: float) -> None:
         """Wait."""
@@ -93,6 +97,10 @@ class VirtualClock:
     def set_wall_clock(self, by_s: float) -> None:
         """Set the wall clock forward (or back), as an administrator would."""
         self._step_ns += round(by_s * NS)
+
+    def stand_still(self, seconds: float) -> None:
+        """Let time pass in which nothing runs: the computer sleeps, or is overloaded."""
+        self._elapsed_ns += round(seconds * NS)
 
     async def sleep(self, seconds: float) -> None:
         """Jump ahead."""

@@ -21,7 +21,7 @@ class EventKind(StrEnum):
 
     START = "start"
     STOP = "stop"
-    #: The state found on disk at the start of the service, and the pause since then (`PauseData`).
+    #: The state found on disk at the start of the service; the pause since then, or a later one (`PauseData`).
     RESTART = "restart"
     #: A new state, or new reasons.
     STATE = "state"
@@ -109,7 +109,7 @@ class ZeroData(_Data, frozen=True, kw_only=True):
 
 
 class PauseData(_Data, frozen=True, kw_only=True):
-    """The pause before the first sample of a service.
+    """A pause: before the first sample of a service, or of a service that stood still.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from compensator.api.loop import diagnosis_in_process
 from compensator.clock import HOUR_NS, NS
 from compensator.config import Config, Loop
 from compensator.errors import CompensatorError, DataError
-from compensator.events import CommandName, EventKind, LoopAction, Note, command_of
+from compensator.events import CommandName, EventKind, LoopAction, LoopData, Note, command_of
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.recording.container import Container
 from compensator.recording.reading import in_order, recordings_in
@@ -200,15 +200,19 @@ class _Summary:
                 self._add_decision(data)
 
     def _add_decision(self, data: Any) -> None:
-        step, effects = LoopAction(data["step"]), tuple(data.get("effects", ()))
+        try:
+            found = msgspec.convert(data, LoopData)
+        except msgspec.ValidationError:
+            return  # of another version
+        step, effects = found.step, tuple(found.effects)
         self._counts[step] += 1
         if step == LoopAction.SHADOW:
             self._found = effects
             if self._proposed and same_effects(effects, self._proposed):
-                self._proposed_sha256 = data.get("model_sha256", "")  # newer parameters are proposed in their place
+                self._proposed_sha256 = found.model_sha256  # newer parameters are proposed in their place
         if step == LoopAction.PROPOSE:
-            self._proposed, self._proposed_sha256 = effects, data.get("model_sha256", "")
-        elif step in _NOT_PROPOSED and data.get("model_sha256", "") == self._proposed_sha256:
+            self._proposed, self._proposed_sha256 = effects, found.model_sha256
+        elif step in _NOT_PROPOSED and found.model_sha256 == self._proposed_sha256:
             self._proposed, self._proposed_sha256 = (), ""
         if step in (LoopAction.ADOPT, LoopAction.BACK):
             self._effects = effects

@@ -19,7 +19,7 @@ from compensator.recording.container import Contents
 from compensator.recording.reading import RawRecord
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import Followed
-from compensator.service.loop.replaying import decisions_in, recorded_loop
+from compensator.service.loop.replaying import decisions_in, hand_over_all, recorded_loop
 from compensator.service.replay import RecordedStep, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
@@ -54,7 +54,7 @@ class ReplayCheck:
             except CompensatorError as error:
                 raise DataError(f"{result.file}: state.json: {error}") from error
         result.model = self.compensation.model.sha256
-        self._loop = recorded_loop(contents, self.compensation, result.file)
+        self._loop = recorded_loop(contents, self.compensation.model, result.file)
         #: A sample of which the estimate or the offset is missing, or either without it: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
@@ -78,7 +78,8 @@ class ReplayCheck:
         step = step_of(records, self._contents, self._result.file)
         for event in step.events:
             self._follow(event)
-        decided = self._loop.apply_inputs(step) if self._loop is not None else []
+        last_ns = self.compensation.status.time_utc_ns
+        decided = hand_over_all(self._loop, step, last_ns) if self._loop is not None else []
         outcome = apply(self.compensation, step)
         if isinstance(outcome, Outcome):
             followed = self._loop.process(outcome) if self._loop is not None else Followed((), ())

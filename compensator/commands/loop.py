@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from concurrent.futures import Executor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compensator.blas import in_one_thread
 from compensator.commands import Answer
 from compensator.commands.progress import progress_bar
-from compensator.commands.workers import workers
+from compensator.commands.workers import in_parallel
 from compensator.errors import DataError
-from compensator.progress import Progress
 
 if TYPE_CHECKING:
-    from compensator.api.shop import MachineLoop, Policy
+    from compensator.api.shop import MachineLoop
     from compensator.report.fleet import FleetRow
 
 
@@ -28,12 +26,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     DataError
         If a folder is none, or no machine's recordings can be used.
     """
+    from compensator.api.shop import loop_of_machine
+
     folders = _folders(arguments.folder)
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
         folders = [folder.resolve() for folder in folders]
-    with progress_bar("machines") as progress, workers(len(folders), arguments.scheduler) as executor:
-        found = _each(folders, arguments.policy, progress, executor)
+    jobs = [partial(loop_of_machine, folder, arguments.policy) for folder in folders]
+    with progress_bar("machines") as progress:
+        found: list[MachineLoop] = in_parallel(jobs, progress, scheduler=arguments.scheduler)
     if all(one.error for one in found):
         raise DataError(found[0].error)
     return _answer(found, arguments.page)
@@ -55,22 +56,6 @@ def _with_recordings(folder: Path) -> list[Path]:
         return [folder]
     below = sorted(one for one in folder.iterdir() if one.is_dir() and not one.is_symlink())
     return [found for one in below for found in _with_recordings(one)]
-
-
-def _each(folders: Sequence[Path], policy: Policy, progress: Progress, executor: Executor | None) -> list[MachineLoop]:
-    """Return what the loop makes of each machine, in their order."""
-    from compensator.api.shop import loop_of_machine
-
-    if executor is None:
-        found = []
-        for i, folder in enumerate(folders):
-            progress(i, len(folders))
-            found.append(in_one_thread(loop_of_machine, folder, policy))
-        return found
-    jobs = [executor.submit(in_one_thread, loop_of_machine, folder, policy) for folder in folders]
-    for i, _ in enumerate(as_completed(jobs)):
-        progress(i + 1, len(jobs))
-    return [job.result() for job in jobs]
 
 
 def _answer(found: Sequence[MachineLoop], page: Path | None) -> Answer:

@@ -58,7 +58,7 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
             raise
 
 
-def in_parallel(jobs: Sequence[Callable[[], Any]], progress: Progress) -> list[Any]:
+def in_parallel(jobs: Sequence[Callable[[], Any]], progress: Progress, *, scheduler: str | None = None) -> list[Any]:
     """Do independent jobs, one process for each as far as there are cores, and return their results in order.
 
     Parameters
@@ -67,9 +67,16 @@ def in_parallel(jobs: Sequence[Callable[[], Any]], progress: Progress) -> list[A
         Without arguments; like their results they can be pickled. The longest first.
     progress : callable
         Called with how many jobs of how many are done.
+    scheduler : str, optional
+        See `workers`.
+
+    Raises
+    ------
+    ServiceError, UsageError
+        As `workers` does.
     """
     progress(0, len(jobs))
-    with workers(len(jobs), None) as executor:
+    with workers(len(jobs), scheduler) as executor:
         if executor is None:
             results = []
             for job in jobs:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ def machine_days(out: Path, name: str, *, seed: int) -> MachineDays:
 
 def _record(seed: int) -> Record:
     """Return what a machine reads; its first effect acts for six days, its second one to the end."""
-    at = {name: HOUR_S * hours for name, hours in TIMES.as_dict().items()}
+    at = {name: HOUR_S * hours for name, hours in asdict(TIMES).items()}
     effects = [
         During(effect=FIRST, from_s=at["first_begins_h"], to_s=at["first_ends_h"]),
         During(effect=SECOND, from_s=at["second_begins_h"]),

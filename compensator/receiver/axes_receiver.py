@@ -14,7 +14,7 @@ from .applied_record import AppliedRecord
 from .axes_applied import NOTHING_READ, AppliedAxes, ControlState
 from .axes_follower import AxesFollower
 from .axes_settings import AxesSettings
-from .client import ANSWER_TIMEOUT_S, Client, bytes_of, monotonic_s, waiting
+from .client import ANSWER_TIMEOUT_S, Client, answered, bytes_of, monotonic_s, waiting
 from .modes import Modes
 from .sample import Sample
 from .tool_length import ToolLength
@@ -129,13 +129,8 @@ class AxesReceiver(Client):
             self._length_answers.append(session.get(key, handler, timeout=ANSWER_TIMEOUT_S))
 
     def _receive_lengths(self, now_s: float, length: ToolLength) -> None:
-        for answers in list(self._length_answers):
-            try:
-                for reply in waiting(answers):
-                    if reply.ok is not None:
-                        length.receive(now_s, bytes_of(reply.ok), utc_ns=self._utc_ns, asked=True)
-            except zenoh.ZError:  # all answers were received
-                self._length_answers.remove(answers)
+        for sample in answered(self._length_answers):
+            length.receive(now_s, bytes_of(sample), utc_ns=self._utc_ns, asked=True)
         if self._lengths is not None:
             utc_ns = self._utc_ns if self._source.check_clock else None
             for sample in waiting(self._lengths):

@@ -198,13 +198,8 @@ class Client(ABC):
         self._accepted |= self._accept(now_s, sample, self._utc_ns if check_age else None, asked=asked)
 
     def _receive_answers(self, now_s: float) -> None:
-        for answers in list(self._answers):
-            try:
-                for reply in waiting(answers):
-                    if reply.ok is not None:
-                        self._receive(now_s, reply.ok, check_age=True, asked=True)
-            except zenoh.ZError:  # all answers were received
-                self._answers.remove(answers)
+        for sample in answered(self._answers):
+            self._receive(now_s, sample, check_age=True, asked=True)
 
     def _receive_tokens(self) -> None:
         for token in waiting(self._tokens):
@@ -231,13 +226,8 @@ class Client(ABC):
         return wanted if self._clock() - received_s <= self._source.valid_max_s else None
 
     def _receive_statuses(self, now_s: float) -> None:
-        for answers in list(self._status_answers):
-            try:
-                for reply in waiting(answers):
-                    if reply.ok is not None:
-                        self._receive_status(now_s, reply.ok, asked=True)
-            except zenoh.ZError:  # all answers were received
-                self._status_answers.remove(answers)
+        for sample in answered(self._status_answers):
+            self._receive_status(now_s, sample, asked=True)
         for sample in waiting(self._statuses):
             self._receive_status(now_s, sample, asked=False)
 
@@ -331,6 +321,17 @@ def waiting(channel: Any) -> Iterator[Any]:
         if (item := channel.try_recv()) is None:
             return
         yield item
+
+
+def answered(queries: list[Any]) -> Iterator[Any]:
+    """Yield what has arrived in answer to queries, and remove those that have all their answers."""
+    for answers in list(queries):
+        try:
+            for reply in waiting(answers):
+                if reply.ok is not None:
+                    yield reply.ok
+        except zenoh.ZError:
+            queries.remove(answers)
 
 
 def bytes_of(sample: Any) -> bytes:

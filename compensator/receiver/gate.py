@@ -12,23 +12,15 @@ from typing import Generic, Protocol, TypeVar
 from .limits import Acceptance
 from .message import Rejected
 from .reasons import Reason, printable
-from .restart import CountRestart
+from .restart import CountRestart, Numbered
 
 
-class Measured(Protocol):
+class Measured(Numbered, Protocol):
     """What is published of one sample."""
 
     @property
     def machine(self) -> str:
         """Machine that published it."""
-
-    @property
-    def seq(self) -> int:
-        """Never repeats for a machine."""
-
-    @property
-    def time_utc_ns(self) -> int:
-        """Time of the measurement, ns since 1970 UTC."""
 
     @property
     def valid_for_s(self) -> float:

@@ -23,7 +23,7 @@ class Numbered(Protocol):
 
     @property
     def seq(self) -> int:
-        """Its number."""
+        """Its number; never repeats for a machine."""
 
     @property
     def time_utc_ns(self) -> int:

@@ -23,14 +23,12 @@ from compensator.recording.signature import Signer
 FULL = LARGEST // 4
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
 TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
-#: Topics of a machine whose Y is probed.
-TOPICS_WITH_PROBES = (*TOPICS, "probe")
 
 
 def topics_of(*, probes: bool, loop: bool, axes: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the topics of a machine's recording: with probes, with another model in shadow, of several axes."""
-    further = ("offsets",) if axes else ()
-    return (*(TOPICS_WITH_PROBES if probes else TOPICS), *(("candidate",) if loop else ()), *further)
+    wanted = {"probe": probes, "candidate": loop, "offsets": bool(axes)}
+    return (*TOPICS, *(topic for topic, is_wanted in wanted.items() if is_wanted))
 
 
 @dataclass(slots=True)

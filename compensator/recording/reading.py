@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -183,6 +183,27 @@ def messages(path: Path, topics: tuple[str, ...], *, prefix: str = "", since_ns:
     for record in read_messages(path, topics, prefix=prefix):
         if record.log_time_ns >= since_ns:
             yield decode(record, path)
+
+
+def files_since(paths: Sequence[Path], from_ns: int) -> list[Path]:
+    """Return the recordings that may contain something of the time since then, ns since 1970 UTC.
+
+    What has the name of a recording and is none says nothing of when it begins.
+
+    Parameters
+    ----------
+    paths : sequence of pathlib.Path
+        In order.
+    from_ns : int
+        The time.
+    """
+    for i in range(len(paths) - 1, 0, -1):
+        first = None
+        with suppress(DataError):
+            first = next(messages(paths[i], ("sample",)), None)
+        if first is not None and first.time_utc_ns <= from_ns:
+            return list(paths[i:])
+    return list(paths)
 
 
 def machines_in(path: Path) -> list[str]:

@@ -96,6 +96,7 @@ def _verified(key: Any, data: bytes, signature: str) -> bool:
 def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[ConfigError] | type[UsageError]) -> Any:
     """Return one half of a pair of keys from its PEM file."""
     try:
+        from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as error:
@@ -110,7 +111,7 @@ def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[C
             key: Any = serialization.load_pem_private_key(data, password=None)
         else:
             key = serialization.load_pem_public_key(data)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         words = _UNREADABLE["exchanged" if half == "public" and b"PRIVATE KEY" in data else half]
         raise error_kind(f"{path}: {words}") from error
     if not isinstance(key, kind):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count
@@ -139,14 +140,13 @@ class _Reader:
         """Read the names of the machine, the model and its effects."""
         self.history.machine = contents.metadata.get("run", {}).get("machine", "") or self.history.machine
         part = contents.attachments.get("model.toml")
-        try:
+        self._model, self._effects = "", []
+        # It may have been made by anybody.
+        with suppress(ValueError, AttributeError, TypeError, KeyError):
             table = parse_toml(part.data) if part else {}
-        except ValueError:
-            table = {}
-        self._model = str(table.get("name", ""))
-        # Of several axes: those of Y.
-        own = table.get("axis", {}).get(FIRST, table)
-        self._effects = [label_of(effect) for effect in own.get("effect", [])]
+            self._model = str(table.get("name", ""))
+            own = table.get("axis", {}).get(FIRST, table)  # of several axes: those of Y
+            self._effects = [label_of(effect) for effect in own.get("effect", [])]
 
     def _sample(self, sample: Sample) -> None:
         t = sample.time_utc_ns * _NS

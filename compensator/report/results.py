@@ -57,7 +57,7 @@ def _diagnosis(page: Path) -> PageFile | None:
     """Return the page of a diagnosis, from its `diagnosis.json`."""
     if page.name.endswith(_CALIBRATION):
         return None
-    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         found = json.loads(read_file(page.with_name("diagnosis.json"), RESULT_BYTES))
         axes = found.get("axes", {})
         tone = worst(diagnosis_tone(one) for one in axes.values() or [found])
@@ -71,7 +71,7 @@ def _calibration(page: Path) -> PageFile | None:
     """Return the page of a calibration, from the model file with its errors."""
     own = page.with_name(f"{page.name.removesuffix(_CALIBRATION)}.toml")
     for path in [own] if page.name.endswith(_CALIBRATION) else sorted(page.parent.glob("*.toml")):
-        with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
             model = parse_toml(read_file(path, MODEL_BYTES))
             parts = {axis: part["provenance"] for axis, part in model.get("axis", {}).items()}
             each = {axis: _errors(origin) for axis, origin in (parts or {"": model["provenance"]}).items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,10 +36,6 @@ class Times:
     break_h: float
     repaired_h: float
     first_ends_h: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Return them by name."""
-        return asdict(self)
 
     def told(self) -> list[tuple[float, str, str]]:
         """Return what happens, in order: when, in a word for the picture, and in a sentence."""
@@ -117,7 +113,7 @@ class MachineDays:
                 "first_model": self.by_day(self.first_um).tolist(),
                 "loop": self.by_day(self.loop_um).tolist(),
             },
-            "happens_h": self.times.as_dict(),
+            "happens_h": asdict(self.times),
             "decisions": [
                 {
                     "time_h": t_h,
@@ -211,20 +207,8 @@ def _picture(days: Sequence[MachineDays]) -> Figure:
         "Above the machine with a displacement sensor, below the one with a touch probe each hour. Each step is one "
         "day; vertical lines: what happens to the machine; points: what the loop decided."
     )
-    first = panels[0]
-    return Figure(
-        title="Error of each day with the first model, and with the loop",
-        x_label=first.x_label,
-        y_label=first.y_label,
-        lines=first.lines,
-        marks=first.marks,
-        edges=first.edges,
-        limits=first.limits,
-        below=tuple(panels[1:]),
-        x_limits=(1.0, DAYS + 1.0),
-        note=note,
-        height=first.height,
-    )
+    title = "Error of each day with the first model, and with the loop"
+    return replace(panels[0], title=title, below=tuple(panels[1:]), note=note)
 
 
 def _panel(one: MachineDays) -> Figure:

@@ -11,13 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
-
 from compensator.arrays import NAN
 from compensator.axes import FIRST, column_of
 from compensator.config_axes import TILTS, Axes
-from compensator.messages import Offset
-from compensator.messages_axes import OFFSETS, AxisOffset
 from compensator.model.engine import Estimate
 from compensator.model.outputs import Output, OutputEstimate
 
@@ -257,36 +253,3 @@ def _constants(axes: Axes, axis: str) -> dict[str, Any]:
     if linear is not None and linear.sign != 1:
         found["sign"] = linear.sign
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class Slanted:
-    """Slope of an axis in its message, its rate and standard deviation, µm/m."""
-
-    value: float
-    rate_per_min: float
-    std: float
-
-
-def axis_message(offset: Offset, axis: str, outputs: FurtherOutputs, slope: Slanted | None) -> AxisOffset:
-    """Return the message of an axis of several.
-
-    Parameters
-    ----------
-    offset : Offset
-        The message as of a machine with this axis alone.
-    axis : str
-        The axis.
-    outputs : FurtherOutputs
-        What the machine has.
-    slope : Slanted, optional
-        Slope of the axis.
-    """
-    fields = msgspec.structs.asdict(offset) | outputs.constants(axis)
-    if slope is not None:
-        fields |= {
-            "y_slope_um_per_m": slope.value,
-            "y_slope_rate_um_per_m_per_min": slope.rate_per_min,
-            "y_slope_std_um_per_m": slope.std,
-        }
-    return OFFSETS[axis](**fields)

@@ -11,9 +11,9 @@ from compensator.arrays import NAN
 from compensator.axes import FIRST
 from compensator.codes import Reason, State, worst_state
 from compensator.messages import Offset
-from compensator.messages_axes import AxisOffset
+from compensator.messages_axes import OFFSETS, AxisOffset
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.axes import FurtherOutputs, OutputPrediction, PlannedOutput, Slanted, axis_message
+from compensator.service.axes import FurtherOutputs, OutputPrediction, PlannedOutput
 from compensator.service.decision import Condition, Decision, OffsetDecision, OffsetLimiter
 from compensator.service.outcome import Prediction, Values
 
@@ -120,16 +120,15 @@ class FurtherDecision:
             own = offset
             if axis != FIRST:
                 own = decided[axis].message(self._model, offset.machine, offset.seq, offset.time_utc_ns, stds[axis])
-            slanted = None
+            fields = self._outputs.constants(axis)
             if slope is not None:
-                own = _with(own, slope)
-                limited = slope.limited
-                slanted = Slanted(
-                    limited.offset_um if limited is not None else NAN,
-                    limited.rate_um_per_min if limited is not None else NAN,
-                    stds[f"{axis}_slope"],
-                )
-            found.append(axis_message(own, axis, self._outputs, slanted))
+                own, limited = _with(own, slope), slope.limited
+                fields = fields | {
+                    "y_slope_um_per_m": limited.offset_um if limited is not None else NAN,
+                    "y_slope_rate_um_per_m_per_min": limited.rate_um_per_min if limited is not None else NAN,
+                    "y_slope_std_um_per_m": stds[f"{axis}_slope"],
+                }
+            found.append(OFFSETS[axis](**msgspec.structs.asdict(own), **fields))
         return tuple(found)
 
 

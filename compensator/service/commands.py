@@ -166,6 +166,8 @@ class Commands:
                 raise ServiceError(f"sha256 = {request.sha256!r}, expected at least {FEWEST_DIGITS} digits of a hash")
             if self._is_answered:
                 raise ServiceError("the candidate was answered already, which acts at the next sample")
+            if self._is_full(name):
+                raise ServiceError("too many commands are waiting")
             if self._adoption.is_under_way:
                 raise ServiceError("another model is being prepared; answer again after the next sample")
             unproposed = "wait, or use --force"
@@ -213,7 +215,7 @@ class Commands:
 
     def _admit_probe(self, payload: bytes, sender: Sender, now_ns: int) -> str:
         """Return the reply to a probe that can be used; one that is refused is recorded, too."""
-        probing, by = self._running().probing, (sender.name, sender.proof)
+        probing = self._running().probing
         try:
             if probing is None:
                 raise ProbeRefused(ProbeCode.NOT_CONFIGURED, "probe: the configuration has no table [probe]")
@@ -221,7 +223,7 @@ class Commands:
         except ProbeRefused as refused:
             self._refuse_unused(refused, now_ns, sender)
             raise
-        received = ReceivedProbe(request=request, received_utc_ns=now_ns, by=by[0], by_proof=by[1])
+        received = ReceivedProbe(request=request, received_utc_ns=now_ns, **sender.data())
         try:
             if self._loop is None:
                 raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")

@@ -137,7 +137,7 @@ async def run_service(
         checks = Note(EventKind.PLAUSIBILITY, described, {})
         daemon = Daemon(
             config=config,
-            compensation=resumed.compensation,
+            compensation=compensation,
             devices=setup.fleet.devices,
             recorder=recorder,
             publish=publish,

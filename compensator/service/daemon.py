@@ -8,8 +8,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +46,6 @@ DISK_PART, DISK_S = 0.4, 2.0
 #: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
 #: and a limit in s. An offset of that age is usable because its rate is published with it.
 PATIENCE_PART, PATIENCE_S = 0.25, 15.0
-
-
-@dataclass(slots=True)
-class Latency:
-    """Seconds from the last byte read to the offset published, for each sample."""
-
-    seconds: list[float] = field(default_factory=list)
-
-    def add(self, value: float, keep: int = 10_000) -> None:
-        """Keep the newest values."""
-        self.seconds.append(value)
-        if len(self.seconds) > keep:
-            del self.seconds[: keep // 2]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,9 +152,12 @@ class Daemon:
         self._pending: asyncio.Task[None] | None = None
         self._earlier = notes
         self._first = True
-        #: Whether the processing of a sample failed midway, so that its file cannot reproduce the state after it.
-        self._failed_midway = False
-        self.latency = Latency()
+        #: Samples since the last one that are not on record: all, and those that the model has followed all the same.
+        self._missing, self._followed = 0, 0
+        #: Whether the file so far cannot reproduce the state before the next sample: processing failed, or a pause.
+        self._needs_file = False
+        #: Seconds from the last byte read to the offset published, of the newest samples.
+        self.latency_s: deque[float] = deque(maxlen=10_000)
 
     async def run(
         self,
@@ -199,10 +190,13 @@ class Daemon:
                 await self._clock.sleep(grid.seconds_to_next_poll())
                 if self._stop:
                     break
+                if await self._began_again(grid):
+                    continue
                 label_ns, last = grid.label_ns, grid.count_poll()
                 await self._step(period_s / polls, label_ns if last else None)
                 if last:
-                    self._note_clock_step(grid.next_sample())
+                    grid.next_sample()
+                    await self._began_again(grid)
                     done += 1
                 self._report(on_sample)
                 if on_poll is not None:
@@ -210,6 +204,21 @@ class Daemon:
         finally:
             await self._close()
             self._report(on_sample)
+
+    async def _began_again(self, grid: Grid) -> bool:
+        """Follow a wall clock that was set, and account for samples while nothing ran; return whether that was so."""
+        found = grid.begin_again()
+        if found is None:
+            return False
+        step_s, missing = found
+        if missing:
+            self._sampler.close_sample()  # its readings are from before and from after
+            await self._await_pending()
+            self._events.sequence += missing
+            self._missing += missing
+        if step_s:
+            self._events.note(EventKind.CLOCK, f"the wall clock was set by {step_s:+.1f} s", {"seconds": step_s})
+        return True
 
     def _report(self, on_sample: Callable[[Outcome], None] | None) -> None:
         outcomes, self._unreported = self._unreported, []
@@ -220,8 +229,7 @@ class Daemon:
     async def _step(self, interval_s: float, label_ns: int | None) -> None:
         """Poll, and process the sample if one ends; on any error hold the offset and report the error.
 
-        This is the supervisor, the only place that catches every exception: a defect must neither stop the service nor
-        move the offset.
+        This is the supervisor: a defect must neither stop the service nor move the offset.
         """
         try:
             await self._sampler.poll(interval_s)
@@ -251,6 +259,8 @@ class Daemon:
         )
         for topic, offset in offsets.items():
             self._publish(topic, encode(offset))
+        self._missing += 1
+        self._followed += self._compensation.status.seq == sequence
         self._events.sequence += 1
 
     @property
@@ -293,8 +303,8 @@ class Daemon:
         self._compensation = self._adoption.swap()
         if self._loop is not None:
             self._compensation = self._loop.before_sample(self._compensation)
-        state, opening, failed_midway = self._compensation.frozen(), self._opening(), self._failed_midway
-        self._failed_midway = True
+        state, opening, needs_file = self._compensation.frozen(), self._opening(), self._needs_file
+        self._needs_file = True
         self._commands.apply(self._compensation)
         if self._loop is not None:
             self._loop.hand_over(self._compensation)
@@ -309,8 +319,8 @@ class Daemon:
         self._deciding, unread = self._commands.drain_probes()
         self._compensation.receive_probes(self._deciding)
         outcome = self._compensation.process(raw)
-        self._failed_midway, self._deciding = False, []
-        if failed_midway:  # once for all consecutive samples that failed
+        self._needs_file, self._deciding = False, []
+        if needs_file:  # once for all consecutive samples that failed
             self._journal.start_new_file()
         for note in outcome.notes:
             self._events.note(*note)
@@ -357,7 +367,7 @@ class Daemon:
         self._note_state(offset, further)
         for topic, message in published.items():
             self._publish(topic, encode(message))
-        self.latency.add(time.perf_counter() - decided.began)
+        self.latency_s.append(time.perf_counter() - decided.began)
         self._publish("sample", entry.sample)
         self._publish("estimate", entry.estimate)
         self._publish("status", encode(self._status(outcome)))
@@ -371,39 +381,43 @@ class Daemon:
         """Return what a recording begins with beside the state of the compensation."""
         return self._loop.opening() if self._loop is not None else {}
 
-    def _pause(self, samples: int | None) -> None:
-        self._compensation.pause(samples)
+    def _pause(self, samples: int | None, followed: int = 0) -> None:
+        self._compensation.pause(None if samples is None else samples - followed)
         if self._loop is not None:
             self._loop.pause(samples)
 
     def _pass_pause(self, label_ns: int) -> None:
-        """Account for the time without measurements before the first sample."""
+        """Account for the time without measurements before a sample."""
         first, self._first = self._first, False
-        last_ns = self._compensation.status.time_utc_ns
-        if not first or last_ns == 0:
+        missing, followed = self._missing, self._followed
+        self._missing, self._followed = 0, 0
+        last_ns, period_s = self._compensation.status.time_utc_ns, self._compensation.model.period_s
+        if last_ns == 0 or not (first or missing):
             return
-        period_s = self._compensation.model.period_s
-        missing = max(round((label_ns - last_ns) / (period_s * NS)) - 1, 0)
-        bridged = self._compensation.bridge_max_min
-        minutes = missing * period_s / 60.0
-        text = f"{missing} sample(s) are missing between the last recording and now; "
-        if label_ns <= last_ns:
-            text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
+        if not first:
+            self._needs_file = True
+            self._pause(missing, followed)
+            self._note_pause(f"{missing} sample(s) are missing since the last one", missing)
+        elif label_ns <= last_ns:
             self._pause(None)
+            text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
+            self._note_pause(text, None)
         else:
+            missing = max(round((label_ns - last_ns) / (period_s * NS)) - 1, 0)
             self._pause(missing)
-            text += (
-                f"{minutes:.0f} min are bridged"
-                if minutes <= bridged
-                else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
-            )
-        known, std = label_ns > last_ns, self._compensation.status.std_um
-        data = PauseData(
-            missing=missing if known else None,
-            minutes=minutes if known else None,
-            bridged=known and minutes <= bridged,
-            y_std_um=std,
-        )
+            self._note_pause(f"{missing} sample(s) are missing between the last recording and now", missing)
+
+    def _note_pause(self, text: str, missing: int | None) -> None:
+        """Note a pause, whose length is unknown if `missing` is None."""
+        std, bridged = self._compensation.status.std_um, self._compensation.bridge_max_min
+        minutes = None if missing is None else missing * self._compensation.model.period_s / 60.0
+        is_bridged = minutes is not None and minutes <= bridged
+        if is_bridged:
+            text += f"; {minutes:.0f} min are bridged"
+        elif minutes is not None:
+            longest = f"(restart.bridge_max_min, here {bridged:.0f} min)"
+            text += f"; {minutes / 60.0:.1f} h cannot be bridged {longest}"
+        data = PauseData(missing=missing, minutes=minutes, bridged=is_bridged, y_std_um=std)
         self._events.note(EventKind.RESTART, text, data.table())
 
     def _status(self, outcome: Outcome) -> Status:
@@ -459,10 +473,6 @@ class Daemon:
                 data["axes"] = {one.axis: {"state": one.state, "reasons": one.reasons} for one in further}
             self._events.note(EventKind.STATE, now, data)
             self._last_state = now
-
-    def _note_clock_step(self, seconds: float) -> None:
-        if seconds:
-            self._events.note(EventKind.CLOCK, f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
     def command(self, name: str, payload: bytes, sender: Sender = UNNAMED) -> Reply:
         """Accept a command from another thread; it acts at the next sample.

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import msgspec
 
 from compensator.arrays import NAN
 from compensator.codes import Reason, State
-from compensator.config import Config
+from compensator.config import Config, Limits
 from compensator.messages import SCHEMA, Offset
 from compensator.model.thermal_model import ThermalModel
+from compensator.service.axes import Bounds, OutputState
 from compensator.service.outcome import Prediction, Values
 from compensator.service.plausibility import JumpWatch, PlausibilityCheck
 from compensator.service.state import Memory
@@ -53,25 +53,6 @@ class Decision(msgspec.Struct, frozen=True):
         )
 
 
-class OffsetLimits(Protocol):
-    """Limits of an offset, in its unit; the names are for µm."""
-
-    @property
-    def offset_max_um(self) -> float:
-        """Largest magnitude."""
-
-    @property
-    def offset_rate_max_um_per_min(self) -> float:
-        """Largest rate."""
-
-
-class Following(Protocol):
-    """What is kept for an output."""
-
-    #: Whether the offset is still moving to that of another model.
-    model_changed: bool
-
-
 class Condition(msgspec.Struct, frozen=True):
     """What a sample means for every axis: reasons that are the machine's, and whether the offsets are held.
 
@@ -96,7 +77,7 @@ class Condition(msgspec.Struct, frozen=True):
 class OffsetLimiter:
     """Keeps the offset within its limits, so that it never jumps; `period_min` is the length of a sample, min."""
 
-    def __init__(self, limits: OffsetLimits, period_min: float) -> None:
+    def __init__(self, limits: Limits | Bounds, period_min: float) -> None:
         self._max_um = limits.offset_max_um
         self._rate_max = limits.offset_rate_max_um_per_min
         self._period_min = period_min
@@ -211,7 +192,7 @@ class OffsetDecision:
         channels: Sequence[str],
         prediction: Prediction | None,
         limiter: OffsetLimiter,
-        memory: Following,
+        memory: Memory | OutputState,
     ) -> Decision:
         """Decide one axis.
 
@@ -227,7 +208,7 @@ class OffsetDecision:
             Predicted deformation of the axis since the zero, in its unit; None before the first zero.
         limiter : OffsetLimiter
             That of the axis.
-        memory : Following
+        memory : Memory or OutputState
             That of the axis.
         """
         if prediction is None:

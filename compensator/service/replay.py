@@ -5,10 +5,11 @@ The audit, the comparison with another model, the restart and the warm-up of ano
 file starts with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
 whose state is in no file: it also accounts for the pauses.
 
-A pause is a number of samples that the compensation did not receive. It cannot be derived from times: the wall clock
-may be set and the computer may sleep, and neither counts as a pause for the service. A pause is therefore
+A pause is a number of samples that the compensation did not receive. It cannot be derived from times, as the wall clock
+may be set. A pause is therefore
 
-- at the start of a service, the pause recorded by that start (`PauseData`), which may be of unknown length;
+- what the service has recorded (`PauseData`): at its start, where it may be of unknown length, or after samples that
+  were not measured or not processed;
 - otherwise, the numbers missing between two samples; the number of a held offset is not missing;
 - if files in between were not given, the time between the two, because numbers do not show it across restarts.
 """

@@ -1,7 +1,8 @@
 """From single readings to samples: when devices are polled, and the robust mean of each channel's readings.
 
 Samples end at whole multiples of the period in UTC. Each wait ends at the next point of this grid, so errors do not
-accumulate. Setting the wall clock changes the labels, not the pace: the step is reported, and the grid starts again.
+accumulate. Setting the wall clock changes the labels, not the pace: the step is reported, and the grid starts again. So
+it does where the service stood still for a sample or longer, and the samples that are missing are counted.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ class Grid:
         self._clock = clock
         self._period_ns = round(period_s * NS)
         self._polls = polls
-        self._index = 0
         self._restart()
+        #: End of the last sample on the monotonic clock, ns.
+        self._last_ns = self._end_ns - self._period_ns
 
     def _restart(self) -> None:
         """Let the current sample end at the next whole multiple of the period."""
@@ -58,24 +60,38 @@ class Grid:
         self._index += 1
         return self._index == self._polls
 
-    def next_sample(self) -> float:
-        """Advance to the next sample.
+    def next_sample(self) -> None:
+        """Advance to the next sample."""
+        off_ns = self._off_ns
+        self._index, self._last_ns = 0, self._end_ns
+        self.label_ns += self._period_ns
+        self._end_ns += self._period_ns
+        if abs(off_ns) <= NS:
+            # Small differences come from a time service that slews the clock: follow it; the labels stay on the grid.
+            self._end_ns -= off_ns
+
+    @property
+    def _off_ns(self) -> int:
+        """By how much the wall clock has been set since the last restart, ns."""
+        return self._clock.utc_ns() - self._clock.monotonic_ns() - (self.label_ns - self._end_ns)
+
+    def begin_again(self) -> tuple[float, int] | None:
+        """Start again before a sample where the wall clock was set, and in one where the next poll is late by a sample.
 
         Returns
         -------
-        float
-            Step of the wall clock since the last sample, s; 0 for the usual small corrections.
+        (float, int) or None
+            Step of the wall clock, s (0 for the usual small corrections), and number of samples that are missing; None
+            where the grid goes on.
         """
-        off_ns = self._clock.utc_ns() - self._clock.monotonic_ns() - (self.label_ns - self._end_ns)
-        self._index = 0
-        late_ns = self._clock.monotonic_ns() - self._end_ns
-        if abs(off_ns) > NS or late_ns >= self._period_ns:
-            self._restart()
-            return off_ns / NS if abs(off_ns) > NS else 0.0
-        # Small differences come from a time service that slews the clock: follow it; the labels stay on the grid.
-        self.label_ns += self._period_ns
-        self._end_ns += self._period_ns - off_ns
-        return 0.0
+        off_ns, is_late = self._off_ns, -self.seconds_to_next_poll() * NS >= self._period_ns
+        was_set = abs(off_ns) > NS
+        if not (is_late or (was_set and self._index == 0)):
+            return None
+        self._restart()
+        missing = round((self._end_ns - self._last_ns) / self._period_ns) - 1
+        self._last_ns = self._end_ns - self._period_ns
+        return off_ns / NS if was_set else 0.0, max(missing, 0) if is_late else 0
 
 
 class ChannelCollector:
@@ -214,7 +230,7 @@ class Sampler:
         for state in self._devices.values():
             self._collect(state)
             if state.task is None:
-                state.task, state.counts = asyncio.create_task(_read(state.device)), True
+                state.task, state.counts = asyncio.create_task(state.device.read()), True
             else:
                 state.add(None, SampleQuality.DEVICE_TIMEOUT)
         awaited = [state.task for state in self._devices.values() if state.task is not None and state.answered]
@@ -261,7 +277,3 @@ class Sampler:
             name = state.device.name
             self._note(EventKind.DEVICE, error or f"{name}: answers again", {"device": name, "ok": not error})
         state.error = error
-
-
-async def _read(device: Device) -> Mapping[int, Reading]:
-    return await device.read()

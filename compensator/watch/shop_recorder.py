@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from compensator import __version__
 from compensator.clock import Clock
-from compensator.events import EventKind
+from compensator.events import EventKind, PauseData, data_of
 from compensator.messages import shipped_schema
 from compensator.messages_axes import ALL_MESSAGES, axis_of
 from compensator.recording.compaction import rewrite
@@ -206,14 +206,15 @@ class ShopRecorder:
         numbers = self._numbers.setdefault(prefix, {})
         if kind in ("sample", "estimate") or axis_of(kind) is not None:
             numbers.setdefault(rest, Sequence()).update(message.seq, message.time_utc_ns)
+        pause = data_of(message, PauseData) if kind == "event" and message.kind == EventKind.RESTART else None
+        if pause is not None and pause.missing is not None:
+            for sequence in numbers.values():
+                sequence.stood_still(pause.missing)
         started_ns = message.started_utc_ns if kind == "status" else 0
         if kind == "event" and message.kind == EventKind.START:
             started_ns = message.time_utc_ns
-        for other in ("y/offset", "sample", "estimate") if started_ns else ():
-            numbers.setdefault(other, Sequence()).started(started_ns)
-        for other, sequence in numbers.items() if started_ns else ():
-            if other.endswith("/offset") and other != "y/offset":
-                sequence.started(started_ns)
+        for sequence in numbers.values() if started_ns else ():
+            sequence.started(started_ns)
 
     def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
         """Truncate the file to its last sync and queue the batch for another file."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
@@ -249,6 +251,12 @@ def test_what_is_no_key_is_said(tmp_path: Path) -> None:
         Signer(wrong)
     with pytest.raises(ConfigError, match="no PEM private key"):
         Signer(public)
+    curve = bytes.fromhex("06082a8648ce3d030107")
+    known = ec.generate_private_key(ec.SECP256R1()).private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption())
+    unknown = base64.b64encode(known.replace(curve, curve[:-1] + b"\x7f"))
+    wrong.write_bytes(b"-----BEGIN PRIVATE KEY-----\n" + unknown + b"\n-----END PRIVATE KEY-----\n")
+    with pytest.raises(ConfigError, match="no PEM private key"):
+        Signer(wrong)  # of a curve that the package does not know
     with pytest.raises(UsageError, match="is a private key"):
         Verifier(private)
     with pytest.raises(UsageError, match="expected a key"):

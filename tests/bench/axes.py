@@ -69,7 +69,7 @@ def day(name: str) -> tuple[float, ...]:
         with samples_timed() as seconds:
             machine.run(SAMPLES)
         assert machine.daemon is not None
-        latency = float(np.median(machine.daemon.latency.seconds)) * 1e3
+        latency = float(np.median(machine.daemon.latency_s)) * 1e3
         size = sum(path.stat().st_size for path in machine.recordings) / 1e6
         began = time.process_time()
         found = audit(machine.recordings)

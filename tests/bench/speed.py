@@ -92,7 +92,7 @@ def simulated_days() -> Iterator[Figure]:
             began = time.perf_counter()
             daemon = asyncio.run(run_service(load(str(config)), clock=clock, samples=1440))
             seconds.append(time.perf_counter() - began)
-        latency = np.array(daemon.latency.seconds) * 1e3
+        latency = np.array(daemon.latency_s) * 1e3
         medians.append(float(np.median(latency)))
         highest.append(float(np.percentile(latency, 99)))
         duty = Duty.working_day(1, hours=24.1)
@@ -130,7 +130,7 @@ def beside_diagnoses() -> Iterator[Figure]:
             for other in others:
                 other.kill()
                 other.wait()
-        found[is_beside] += [1e3 * seconds for seconds in daemon.latency.seconds]
+        found[is_beside] += [1e3 * seconds for seconds in daemon.latency_s]
     for is_beside, name in ((False, "alone"), (True, "beside a diagnosis on each core")):
         middle, high = np.percentile(found[is_beside], [50, 99])
         what = f"end of the last poll to offset published, {name}: median, 99th percentile"

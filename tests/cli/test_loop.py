@@ -101,6 +101,12 @@ def test_a_proposal_asks_something_of_a_person_whatever_happens_to_other_models(
     assert one["proposed"] == proposed and bool(one["needs"]) == bool(proposed)
 
 
+def test_a_decision_of_another_version_ends_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = (*TOLD, (350, "loop", "a step of a later version", {"step": "muse"}), (351, "loop", "nothing", {}))
+    (one,) = result([str(recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=told))], capsys)
+    assert one["proposed"] == ["gain:DTF"]
+
+
 def test_newer_parameters_of_a_proposal_take_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     newer = LoopData(step=LoopAction.SHADOW, role="candidate", model_sha256="b" * 64, effects=["gain:DTF"])
     falls = LoopData(step=LoopAction.WITHDRAW, role="candidate", model_sha256="b" * 64)

@@ -239,6 +239,18 @@ def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest
     assert "Calibration: The &lt;spindle&gt;" in page
 
 
+@pytest.mark.parametrize(
+    ("name", "data"), [("diagnosis.json", "[]"), ("diagnosis.json", '{"axes": []}'), ("model.toml", "axis = 3\n")]
+)
+def test_a_file_beside_a_page_that_says_nothing_ends_no_report(
+    tmp_path: Path, name: str, data: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text(data, encoding="utf-8")
+    write_page(tmp_path / "report.html", Page(title="a page", verdict="of ours"))
+    assert main(["report", str(tmp_path), "--out", str(tmp_path / "all.html")]) == 0
+    assert capsys.readouterr().err == ""
+
+
 # ---------------------------------------------------------------------------- memory
 
 

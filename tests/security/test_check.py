@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import datetime
 import json
 import re
@@ -9,6 +10,8 @@ import shutil
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from compensator.certificates import check_files, remarks
 from compensator.cli import main
@@ -62,8 +65,12 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, keys: Path, capsys: p
     capsys.readouterr()
     key.write_bytes((keys / "machine-vmc-08.key").read_bytes())
     assert "not the key of" in refused(config, capsys)
-    key.write_bytes(b"nonsense")
-    assert "not a PEM file" in refused(config, capsys)
+    curve = bytes.fromhex("06082a8648ce3d030107")
+    known = ec.generate_private_key(ec.SECP256R1()).private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption())
+    unknown = base64.b64encode(known.replace(curve, curve[:-1] + b"\x7f"))
+    for bad in (b"nonsense", b"-----BEGIN PRIVATE KEY-----\n" + unknown + b"\n-----END PRIVATE KEY-----\n"):
+        key.write_bytes(bad)
+        assert "not a PEM file" in refused(config, capsys)
     key.write_bytes(good)
     ca.write_bytes((keys.parent / "other/ca.pem").read_bytes())
     assert "not issued by the authority" in refused(config, capsys)

@@ -24,8 +24,8 @@ from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.loop.live import LoopParts
-from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.resuming import resume_loop
+from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
@@ -90,7 +90,7 @@ class Machine:
         assert self.daemon is not None
         return self.promises.add(self.daemon.command(name, payload))
 
-    async def diagnose(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+    async def diagnose(self, wanted: Running, calibrated: bytes) -> Diagnosed:
         """Stand in for the process of a diagnosis."""
         raise NotImplementedError
 

@@ -79,6 +79,7 @@ class Shop:
         #: What each control applied after each sample.
         self.applied: list[list[float]] = [[], []]
         self.walls: list[int] = []
+        self._set_by_s, self._at_end = 0.0, False
 
     async def _advance(self, t_s: float) -> None:
         self.world.advance_to(t_s)
@@ -87,7 +88,14 @@ class Shop:
         with self.router, self.publisher, self.controls[0], self.controls[1]:
             for control in self.controls:
                 until(lambda control=control: control.poll() and control.connected, "connected")  # type: ignore[misc]
-            await self.daemon.run(samples=SAMPLES, on_sample=self._step)
+            await self.daemon.run(samples=SAMPLES, on_sample=self._step, on_poll=self._set)
+
+    def _set(self) -> None:
+        """Set the clock within a sample, after its first poll."""
+        if not self._at_end:
+            self.clock.set_wall_clock(self._set_by_s)
+            self._set_by_s = 0.0
+        self._at_end = False
 
     def _step(self, outcome: Outcome) -> None:
         seq = outcome.offset.seq
@@ -104,7 +112,7 @@ class Shop:
             assert now.state == "following", (seq, now.text)
             applied.append(now.offset_um)
         if seq + 1 in (FORWARD, BACK):
-            self.clock.set_wall_clock(3600.0 if seq + 1 == FORWARD else -3600.0)
+            self._set_by_s, self._at_end = (3600.0 if seq + 1 == FORWARD else -3600.0), True
 
 
 @pytest.mark.timeout(120)

@@ -13,6 +13,7 @@ from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Shadow
 from compensator.service.transfer.model_store import sha256_of
+from tests.service.living import MACHINE
 from tests.service.looping import extended, shown, stronger
 from tests.service.test_loop_service import EVENING, Asked, Looping, checked
 from tests.service.test_loop_several import Early
@@ -42,6 +43,12 @@ def unharmed(machine: Looping, samples: int) -> None:
     assert {outcome.offset.model_sha256 for outcome in machine.outcomes} == {sha256_of(QUILL)}
     assert machine.store.in_use() == machine.store.calibrated() == QUILL
     assert not any("internal_error" in outcome.offset.reasons for outcome in machine.outcomes)
+
+
+def taken(machine: Looping) -> list[str]:
+    """Return the hashes of what is in shadow."""
+    loop = machine.daemon._loop  # type: ignore[union-attr]
+    return [place.sha256 for place in loop._core.state.taken]  # type: ignore[union-attr]
 
 
 def said(machine: Looping) -> str:
@@ -112,6 +119,16 @@ async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, mo
     monkeypatch.undo()
     assert said(machine).endswith("the loop is off until the next start")
     unharmed(machine, EVENING + 120)
+
+
+async def test_a_file_that_has_the_name_of_a_recording_only_takes_no_state(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(EVENING + 60)
+    before = taken(machine)
+    (machine.recordings / f"{MACHINE}_20990101T000000Z.mcap").write_bytes(b"x\n")
+    await machine.run(60)
+    assert before and taken(machine) == before
+    assert not any("without its state" in event.text for event in machine.events("restart"))
 
 
 async def test_at_the_start_of_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

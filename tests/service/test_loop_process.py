@@ -15,13 +15,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import DiagnosisProcess
+from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import Diagnosed
 from tests.service.looping import extended, settings
 from tests.service.test_restart import QUILL
 
-WANTED = StartDiagnosis(from_utc_ns=0, to_utc_ns=1_767_592_800_000_000_000, why="planned")
+WANTED = Running(from_utc_ns=0, to_utc_ns=1_767_592_800_000_000_000, why="planned")
 
 
 def process(folder: Path, script: str, **changes: Any) -> DiagnosisProcess:

@@ -84,6 +84,10 @@ async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(t
         assert np.array_equal(values, read.columns[name], equal_nan=True), name
     zeros = [o.sample.time_utc_ns for o in service.outcomes[50:] if any(note.kind == "zero" for note in o.notes)]
     assert len(zeros) == 1 and found.zeros_ns == zeros
+    # What has the name of a recording and is none keeps nothing from being diagnosed.
+    for name in ("20200101T000000Z", "20990101T000000Z"):
+        (service.recordings / f"{MACHINE}_{name}.mcap").write_bytes(b"x\n")
+    assert read_record(job) == found
 
 
 def test_a_time_without_a_sample_is_refused() -> None:

@@ -23,10 +23,9 @@ from compensator.config import parse_config
 from compensator.messages import Candidate, Event
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
-from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.shadow import Shadow
-from compensator.service.loop.state import LoopState, decode_loop
+from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
@@ -71,7 +70,7 @@ class Looping(Machine):
         start_ns = START_NS + (20 * 60 - before_night) * 60 * NS
         super().__init__(folder, parse_config(data, source="test"), start_ns=start_ns)
         self.config_bytes, self.acts, self.found = data, acts, list(found)
-        self.asked: list[StartDiagnosis] = []
+        self.asked: list[Running] = []
         self.state_um = 0.0
         rng = np.random.default_rng(7)
         self.device.sources[3] = self.coolant_degc
@@ -105,7 +104,7 @@ class Looping(Machine):
             self.lag[i] = keep * self.lag[i - 1] + (1.0 - keep) * driven
         return 3.0 * self.acts(now // 2) * self.lag[now]
 
-    async def diagnose(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+    async def diagnose(self, wanted: Running, calibrated: bytes) -> Diagnosed:
         assert calibrated == QUILL
         self.asked.append(wanted)
         return self.found.pop(0) if len(self.found) > 1 else self.found[0]
@@ -351,7 +350,7 @@ async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made
     machine = Looping(tmp_path, shown(extended()))
     hangs, machine.waits_for_diagnoses = asyncio.Event(), False
 
-    async def hanging(wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+    async def hanging(wanted: Running, calibrated: bytes) -> Diagnosed:
         machine.asked.append(wanted)
         await hangs.wait()
         raise AssertionError
@@ -370,7 +369,7 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
     machine = Looping(tmp_path, shown(extended()))
     machine.waits_for_diagnoses = False
 
-    async def hanging(wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+    async def hanging(wanted: Running, calibrated: bytes) -> Diagnosed:
         machine.asked.append(wanted)
         await asyncio.Event().wait()
         raise AssertionError

@@ -26,7 +26,7 @@ from compensator.service.loop import live
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.found import Found
-from compensator.service.loop.loop import Loop, StartDiagnosis
+from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
 from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running
@@ -309,7 +309,7 @@ def test_a_warm_up_that_nothing_waits_for_does_not_end_the_diagnosis_under_way(t
     parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
     loop = live.LiveLoop(settings(), parts, tmp_path, events=Mock(), journal=Mock(), clock=Mock())
     dismissed = DiagnosisData(verdict="explained", candidate_sha256="c" * 64)
-    wanted = StartDiagnosis(from_utc_ns=0, to_utc_ns=1, why="misfit")
+    wanted = Running(from_utc_ns=0, to_utc_ns=1, why="misfit")
     loop._warming = Found(wanted, Weighed(dismissed, b""), "", why="the candidate cannot be warmed up")
     loop.hand_over(Mock())
     assert core.state.diagnosis is under_way and loop._warming is None
@@ -324,7 +324,7 @@ def test_the_result_of_a_diagnosis_that_has_ended_is_not_taken_for_that_of_the_n
     loop = live.LiveLoop(settings(), parts, tmp_path, events=events, journal=Mock(), clock=Mock())
     nothing = Weighed(DiagnosisData(verdict="adequate"), None)
     for to_utc_ns, taken in ((1, False), (2, True)):
-        wanted = StartDiagnosis(from_utc_ns=0, to_utc_ns=to_utc_ns, why="planned")
+        wanted = Running(from_utc_ns=0, to_utc_ns=to_utc_ns, why="planned")
         loop._found = Found(wanted, nothing, "nothing to deploy")
         loop.hand_over(Mock())
         assert events.note.called is taken and (core.state.diagnosis is under_way) is not taken

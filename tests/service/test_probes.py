@@ -740,9 +740,9 @@ async def test_no_sample_is_late_by_probes(tmp_path: Path) -> None:
             machine.probe(feature=f"f{i}", time_utc_ns=machine.clock.utc_ns() - i * 2 * NS) for i in range(20)
         ]
     await machine.run(100)
-    assert machine.daemon is not None and machine.daemon.latency.seconds
+    assert machine.daemon is not None and machine.daemon.latency_s
     # The median: another program of this computer may delay a single one.
-    usual = float(np.median(machine.daemon.latency.seconds[40:]))
+    usual = float(np.median(list(machine.daemon.latency_s)[40:]))
     assert usual < 0.5, usual
     assert np.diff([outcome.sample.time_utc_ns for outcome in machine.outcomes]).tolist() == [MINUTE_NS] * 99
     assert ProbeCode.TOO_MANY_FEATURES in machine.codes()

@@ -78,7 +78,7 @@ async def test_a_torn_last_sample_counts_and_its_offset_does_not(tmp_path: Path)
 
 
 async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Path) -> None:
-    """A poll that failed leaves an offset without a sample, whose number is not missing, and a hold until resume."""
+    """A poll that failed leaves an offset without a sample, which is a pause, and a hold until resume."""
     machine = machine_with(tmp_path, {})
     broken = [0]
     read = machine.device.read
@@ -93,9 +93,9 @@ async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Pa
     machine.at_sample[60] = lambda: broken.__setitem__(0, 6)
     await machine.run(100)
     assert broken[0] < 0
-    (path,) = recordings(machine.recordings, MACHINE)
+    path, after = recordings(machine.recordings, MACHINE)
     held = [step for step in steps_of(path) if step.sample is None and step.offset is not None]
-    assert len(held) == 1
+    assert len(held) == 1 and next(steps_of(after)).sample is not None
     at_end = number(machine.outcomes[-1].offset.y_offset_um)
     await machine.run(30)
     after = [outcome.offset for outcome in machine.outcomes[-30:]]

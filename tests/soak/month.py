@@ -318,5 +318,6 @@ def count_minutes(folder: Path, result: Month) -> None:
     result.samples = len(times)
     whole = round((times[-1] - times[0]) / (60 * NS)) + 1
     minutes["sample"], minutes["held after an internal error"] = len(times), len(held)
+    minutes["service away"] -= len(held)  # a service counts them as missing, too
     minutes["not accounted for"] = whole - sum(minutes.values())
     result.minutes = dict(minutes)

@@ -78,9 +78,9 @@ def rows() -> Any:
     return dataclasses.field(metadata={"read": lambda table, key: table.rows(key)})
 
 
-def optional_rows(*, default: tuple[tuple[float, ...], ...] = ()) -> Any:
+def optional_rows() -> Any:
     """Return a parameter that the model file holds or leaves out: a list of lists of numbers."""
-    return dataclasses.field(default=default, metadata={"read": lambda table, key: table.rows(key, needed=False)})
+    return dataclasses.field(default=(), metadata={"read": lambda table, key: table.rows(key, needed=False)})
 
 
 def only(*, default: str) -> Any:

@@ -17,7 +17,7 @@ from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.place import is_asked, leads
 from compensator.service.loop.proof import is_clearly_better
-from compensator.service.loop.state import LoopState, Place, same_effects
+from compensator.service.loop.state import LoopState, Place, is_fewer, same_effects
 
 
 class Choice:
@@ -118,4 +118,4 @@ class Choice:
 
     def _has_more_and_waits(self, one: Place, place: Place) -> bool:
         """Return whether a candidate has all effects of another one and more, and cannot be adopted yet."""
-        return set(place.effects) < set(one.effects) and self._compared(one).level_um is None
+        return is_fewer(place.effects, of=one.effects) and self._compared(one).level_um is None

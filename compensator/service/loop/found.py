@@ -15,7 +15,7 @@ from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.shadow import Shadow
-from compensator.service.loop.state import StartDiagnosis
+from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import Weighed, failed, without_effect
 from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
@@ -30,7 +30,7 @@ class Found:
 
     Parameters
     ----------
-    wanted : StartDiagnosis
+    wanted : Running
         What was diagnosed.
     weighed : Weighed
         The diagnosis, and what follows from it.
@@ -44,7 +44,7 @@ class Found:
         Why the candidate cannot be used; empty if it can.
     """
 
-    wanted: StartDiagnosis
+    wanted: Running
     weighed: Weighed
     text: str
     warmed: tuple[Compensation, ErrorBlocks] | None = None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -12,7 +15,7 @@ from compensator.errors import DataError
 from compensator.events import EventKind
 from compensator.input_file import RESULT_BYTES, read_file
 from compensator.messages import UNREADABLE, Event, Offset, Probe, Sample
-from compensator.recording.reading import messages, recordings
+from compensator.recording.reading import files_since, messages, recordings
 
 #: Files in the folder of a diagnosis: the job with the calibrated model; and the result, written last.
 JOB, CALIBRATED, RESULT = "job.json", "calibrated.toml", "result.json"
@@ -93,12 +96,12 @@ class JobRecord:
 
 
 def read_record(job: Job) -> JobRecord:
-    """Return the record of a job."""
+    """Return the record of a job; of a damaged recording what comes before the damage."""
     samples: dict[int, Sample] = {}
     offsets: dict[int, Offset] = {}
     probes, zeros = list[Probe](), set[int]()
-    for path in _files(job):
-        for message in messages(path, ("sample", "offset", "probe", "event")):
+    for path in files_since(recordings(Path(job.recordings), job.machine), job.from_utc_ns):
+        for message in _usable_messages(path):
             if isinstance(message, Event):
                 if message.kind == EventKind.ZERO and message.seq is not None:
                     zeros.add(message.seq)
@@ -117,13 +120,6 @@ def read_record(job: Job) -> JobRecord:
     )
 
 
-def _files(job: Job) -> list[Path]:
-    """Return the recordings that may contain something of the time: not those that were finished before it."""
-    found = recordings(Path(job.recordings), job.machine)
-    newer = [i for i, path in enumerate(found) if _first_ns(path) <= job.from_utc_ns]
-    return found[newer[-1] if newer else 0 :]
-
-
-def _first_ns(path: Path) -> int:
-    first = next(iter(messages(path, ("sample",))), None)
-    return first.time_utc_ns if first is not None else 2**63
+def _usable_messages(path: Path) -> Iterator[Any]:
+    with suppress(DataError):
+        yield from messages(path, ("sample", "offset", "probe", "event"))

@@ -237,15 +237,21 @@ class LiveLoop:
         ServiceError
             If there is no such candidate, or it is not proposed and `unproposed` is given.
         """
-        core = self._core
-        if core is None or core.state.exchange:
+
+        def offered(core: ModelLoop) -> Offer | None:
+            if core.state.exchange:
+                return None
+            candidate = core.loop.meant(sha256)
+            words = f"{candidate.sha256[:12]} ({named(candidate.effects)})"
+            verdict = changed(candidate.verdict, offset_change_um=core.offset_change_um(present, candidate.sha256))
+            if not candidate.is_proposed and unproposed:
+                raise ServiceError(f"candidate {words} is not proposed yet: {described(verdict)}; {unproposed}")
+            return Offer(candidate.sha256, words, verdict)
+
+        offer = self._guarded(offered, None)
+        if offer is None:
             raise ServiceError("there is no candidate now; see `compensator watch`")
-        candidate = core.loop.meant(sha256)
-        words = f"{candidate.sha256[:12]} ({named(candidate.effects)})"
-        verdict = changed(candidate.verdict, offset_change_um=core.offset_change_um(present, candidate.sha256))
-        if not candidate.is_proposed and unproposed:
-            raise ServiceError(f"candidate {words} is not proposed yet: {described(verdict)}; {unproposed}")
-        return Offer(candidate.sha256, words, verdict)
+        return offer
 
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after an operator has changed the model."""

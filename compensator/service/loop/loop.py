@@ -34,7 +34,7 @@ from compensator.service.loop.place import (
     with_effects,
 )
 from compensator.service.loop.schedule import begin_again, begin_if_due, errs, pass_planned
-from compensator.service.loop.state import LoopState, Place, Role, Running, StartDiagnosis, same_effects
+from compensator.service.loop.state import LoopState, Place, Role, Running, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -77,10 +77,10 @@ class Loop:
         self.state.effects = list(effects)
 
     @property
-    def wanted(self) -> StartDiagnosis | None:
+    def wanted(self) -> Running | None:
         """The diagnosis that is under way, to be begun or begun again; None if there is none."""
         running = self.state.diagnosis
-        return None if running is None or running.candidate_sha256 else running.wanted
+        return None if running is None or running.candidate_sha256 else running
 
     def compared(self, place: Place) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
@@ -373,6 +373,8 @@ class Loop:
             raise ServiceError(
                 f"candidate {sha256[:12]} has given its place; now there is {_named(first)}; see `compensator watch`"
             )
+        if len(meant) > 1:
+            raise ServiceError(f"{len(meant)} candidates begin with {sha256}; expected more digits of the hash")
         return meant[0]
 
     def model_changed(

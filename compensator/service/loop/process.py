@@ -26,13 +26,13 @@ from compensator.errors import CompensatorError
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
 from compensator.messages import UNREADABLE
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result
-from compensator.service.loop.state import StartDiagnosis
+from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import FAILED, Diagnosed, failed
 
 log = logging.getLogger("compensator")
 
 #: Makes a diagnosis of what is wanted, from a calibrated model.
-Diagnose = Callable[[StartDiagnosis, bytes], Awaitable[Diagnosed]]
+Diagnose = Callable[[Running, bytes], Awaitable[Diagnosed]]
 #: Module that the process runs.
 MODULE = "compensator.commands.loop_diagnosis"
 #: Diagnoses whose files are kept.
@@ -63,7 +63,7 @@ class DiagnosisProcess:
         self._recordings, self._folder = recordings, folder
         self._command = command or (sys.executable, "-m", MODULE)
 
-    async def __call__(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+    async def __call__(self, wanted: Running, calibrated: bytes) -> Diagnosed:
         """Make a diagnosis; it never raises a `CompensatorError`."""
         stamp = datetime.fromtimestamp(wanted.to_utc_ns / NS, UTC).strftime("%Y-%m-%dT%H%M%SZ")
         work = self._folder / f"{stamp}{_UNFINISHED}"
@@ -76,7 +76,7 @@ class DiagnosisProcess:
             return failed(str(error))
         return found
 
-    def _prepare(self, work: Path, wanted: StartDiagnosis, calibrated: bytes) -> None:
+    def _prepare(self, work: Path, wanted: Running, calibrated: bytes) -> None:
         """Remove what interrupted diagnoses have left, and write the job."""
         for left in self._folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(left, ignore_errors=True)

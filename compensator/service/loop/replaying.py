@@ -7,9 +7,9 @@ from contextlib import suppress
 from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import CommandName, DiagnosisData, EventKind, LoopAction, LoopData, Note, command_of, data_of
 from compensator.messages import Event
+from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Contents
-from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
+from compensator.service.loop.core import LOOP_STATE, ModelLoop
 from compensator.service.loop.ending import FAILED_OUTSIDE
 from compensator.service.replay import RecordedStep, setup_of
 
@@ -27,34 +27,14 @@ _DECIDED = (
 )
 
 
-class RecordedLoop:
-    """The loop of one recording.
+def hand_over_all(core: ModelLoop, step: RecordedStep, now_ns: int) -> list[Note]:
+    """Hand over what reached the loop before the sample of a group; return the decisions that followed.
 
-    Parameters
-    ----------
-    core : ModelLoop
-        In its state at the start of the file.
-    compensation : Compensation
-        The present compensation, replayed beside it.
+    `now_ns` is the time of the last sample, ns since 1970 UTC.
     """
-
-    def __init__(self, core: ModelLoop, compensation: Compensation) -> None:
-        self.core = core
-        self._compensation = compensation
-
-    def apply_inputs(self, step: RecordedStep) -> list[Note]:
-        """Hand over what reached the loop before the sample of a group; return the decisions that followed."""
-        now_ns, notes = self._compensation.status.time_utc_ns, list[Note]()
-        held = step.offset if step.sample is None else None
-        seq = step.sample.seq if step.sample is not None else held.seq if held is not None else None
-        for event in step.events:
-            if event.seq == seq:
-                notes += hand_over(self.core, event, now_ns)
-        return notes
-
-    def process(self, outcome: Outcome) -> Followed:
-        """Process the sample of the group."""
-        return self.core.process(outcome)
+    held = step.offset if step.sample is None else None
+    seq = step.sample.seq if step.sample is not None else held.seq if held is not None else None
+    return [note for event in step.events if event.seq == seq for note in hand_over(core, event, now_ns)]
 
 
 def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
@@ -88,8 +68,8 @@ def _meant(event: Event) -> str:
     return sha256 if isinstance(sha256, str) else ""
 
 
-def recorded_loop(contents: Contents, compensation: Compensation, file: str) -> RecordedLoop | None:
-    """Return the loop of a recording; None if it has none.
+def recorded_loop(contents: Contents, present: ThermalModel, file: str) -> ModelLoop | None:
+    """Return the loop of a recording in its state at the start of the file; None if it has none.
 
     Raises
     ------
@@ -101,7 +81,7 @@ def recorded_loop(contents: Contents, compensation: Compensation, file: str) -> 
         return None
     try:
         config, _ = setup_of(contents, file)
-        return RecordedLoop(ModelLoop(config, compensation.model, found), compensation)
+        return ModelLoop(config, present, found)
     except CompensatorError as error:
         raise DataError(f"{file}: {error}") from error
 

@@ -14,14 +14,14 @@ from pathlib import Path
 
 from compensator.clock import HOUR_NS
 from compensator.config import Config, LoadedConfig
-from compensator.errors import CompensatorError
+from compensator.errors import CompensatorError, DataError
 from compensator.events import Note
 from compensator.recording.container import Container
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, ModelLoop
-from compensator.service.loop.replaying import RecordedLoop, recorded_loop
+from compensator.service.loop.replaying import hand_over_all, recorded_loop
 from compensator.service.loop.storing import calibrated_effects
 from compensator.service.loop.weighing import effect_names
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
@@ -35,7 +35,7 @@ log = logging.getLogger("compensator")
 class _Replayed:
     """The last recording with a loop, at its end."""
 
-    loop: RecordedLoop
+    core: ModelLoop
     compensation: Compensation
     config: bytes
     model: bytes
@@ -72,7 +72,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
         core = ModelLoop(config, present.model, {})
         core.state.base_effects = list(calibrated)
         return core
-    core = last.loop.core
+    core = last.core
     core.state.missing = 0  # how long the service has been away is known from the last sample on
     if last.config == loaded.data and last.is_last:
         if last.compensation.model.sha256 == present.model.sha256:
@@ -93,22 +93,25 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
 def _complete(resumed: Resumed, last: _Replayed) -> list[Note]:
     """Complete an exchange whose model is stored already."""
     old = last.compensation
-    resumed.compensation, _, notes = last.loop.core.exchange(old, last.model, old.status.time_utc_ns)
+    resumed.compensation, _, notes = last.core.exchange(old, last.model, old.status.time_utc_ns)
     return notes
 
 
 def _replayed(config: Config, folder: Path) -> _Replayed | None:
     """Replay the last recording with a loop, unless that is so old that nothing it knew counts any longer."""
     machine, is_last = config.machine.name, True
-    paths = recordings(folder, machine)
     assert config.loop is not None
-    oldest_ns = began_ns(paths[-1], machine) - config.loop.watch_h * HOUR_NS if paths else 0
-    for path in reversed(paths):
-        if began_ns(path, machine) < oldest_ns:
-            return None
-        opening = opening_of(path)
+    newest_ns: int | None = None
+    for path in reversed(recordings(folder, machine)):
+        try:
+            opening = opening_of(path)
+        except DataError:
+            continue  # it has the name of a recording and is none
         if "state.json" not in opening:
             continue
+        newest_ns = newest_ns or began_ns(path, machine)
+        if began_ns(path, machine) < newest_ns - config.loop.watch_h * HOUR_NS:
+            return None
         if LOOP_STATE not in opening:
             is_last = False
             continue
@@ -116,12 +119,12 @@ def _replayed(config: Config, folder: Path) -> _Replayed | None:
             contents = container.survey(whole=False)
             compensation = Compensation(*setup_of(contents, path.name))
             compensation.restore(opening["state.json"])
-            loop = recorded_loop(contents, compensation, path.name)
-            assert loop is not None
+            core = recorded_loop(contents, compensation.model, path.name)
+            assert core is not None
             for step in steps_in(container):
-                loop.apply_inputs(step)
+                hand_over_all(core, step, compensation.status.time_utc_ns)
                 outcome = apply(compensation, step)
                 if isinstance(outcome, Outcome):
-                    loop.process(outcome)
-        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"], is_last)
+                    core.process(outcome)
+        return _Replayed(core, compensation, opening["config.toml"], opening["model.toml"], is_last)
     return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
@@ -42,21 +41,8 @@ def is_fewer(effects: Sequence[str], of: Sequence[str]) -> bool:
     return Counter(effects) < Counter(of)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartDiagnosis:
-    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC.
-
-    With `without` it is none: the present model without this effect is wanted.
-    """
-
-    from_utc_ns: int
-    to_utc_ns: int
-    why: str
-    without: str = ""
-
-
 class Running(msgspec.Struct, frozen=True, kw_only=True):
-    """A diagnosis: what is diagnosed, why, how often it was begun, and whether its candidate is being warmed up.
+    """A diagnosis: of what is on record between two times, why, how often begun, and the candidate that is warmed up.
 
     `found` is its result then. `is_next`: the candidate gets its place before the next sample. `without`: nothing is
     diagnosed, the candidate is the present model without this effect.
@@ -70,13 +56,6 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     found: DiagnosisData | None = None
     is_next: bool = False
     without: str = ""
-
-    @property
-    def wanted(self) -> StartDiagnosis:
-        """What is begun by it."""
-        return StartDiagnosis(
-            from_utc_ns=self.from_utc_ns, to_utc_ns=self.to_utc_ns, why=self.why, without=self.without
-        )
 
 
 class Place(msgspec.Struct, kw_only=True):

@@ -61,7 +61,7 @@ class Storing:
             else:
                 self._store.adopt(shadow.data, name=model.name, time_utc_ns=now_ns, by_loop=True)
 
-        self._task = asyncio.create_task(self._store_model(store))
+        self._task = asyncio.create_task(self._stored(store))
 
     def begin_again(self, model: bytes, name: str) -> None:
         """Store the present model again, after another one was stored that has not replaced it."""
@@ -71,7 +71,7 @@ class Storing:
         def store() -> None:
             self._store.adopt(model, name=name, time_utc_ns=now_ns, by_loop=True)
 
-        self._task = asyncio.create_task(self._store_present(store))
+        self._task = asyncio.create_task(self._stored(store, again=True))
 
     def cancel(self) -> None:
         """Forget what is being stored, and what was."""
@@ -85,17 +85,13 @@ class Storing:
         if self._task is not None:
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def _store_model(self, store: Callable[[], None]) -> None:
+    async def _stored(self, store: Callable[[], None], *, again: bool = False) -> None:
         try:
             await asyncio.to_thread(store)
-            self.is_done = True
+            self.is_done = not again
         except ServiceError as error:
-            self.refused = str(error)
-        self._task = None
-
-    async def _store_present(self, store: Callable[[], None]) -> None:
-        try:
-            await asyncio.to_thread(store)
-        except ServiceError as error:
-            log.error("the next start uses another model: %s", error)
+            if again:
+                log.error("the next start uses another model: %s", error)
+            else:
+                self.refused = str(error)
         self._task = None

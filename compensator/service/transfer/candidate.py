@@ -20,7 +20,7 @@ from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, command_of
 from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording.reading import RawRecord, decode, read_messages, recordings
+from compensator.recording.reading import RawRecord, decode, files_since, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
 from compensator.service.state import decode_state
@@ -279,7 +279,7 @@ def window_of(
         if window.at_rest is not None:
             break
         zero = opening or zero
-    window.files = files[_first_needed(files, window.from_ns) :]
+    window.files = files_since(files, window.from_ns)
     return window
 
 
@@ -290,15 +290,6 @@ def usable_steps(path: Path) -> Iterator[RecordedStep]:
     """
     with suppress(DataError):
         yield from steps_of(path)
-
-
-def _first_needed(files: list[Path], from_ns: int) -> int:
-    """Return the index of the last file that starts before a time."""
-    for i in range(len(files) - 1, 0, -1):
-        first = next((step.sample for step in usable_steps(files[i]) if step.sample is not None), None)
-        if first is not None and first.time_utc_ns <= from_ns:
-            return i
-    return 0
 
 
 def _last_estimate(files: list[Path]) -> EstimateMessage | None:

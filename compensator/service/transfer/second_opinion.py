@@ -177,7 +177,7 @@ def _run(
         if sample is not None and (sample.seq <= runs[0].seq or sample.time_utc_ns < window.from_ns):
             continue
         if not begun:
-            zero = _recorded_zero(step)
+            zero = Zero.set_in(step.estimate) if step.sample is not None else None
             if zero is None:
                 continue
             if zero.is_absolute and any(model.inputs == "changes" for model in models):
@@ -204,11 +204,6 @@ def _steps(window: Window, between_samples: Callable[[], None]) -> Iterator[Reco
         for step in usable_steps(path):
             yield step
             between_samples()
-
-
-def _recorded_zero(step: RecordedStep) -> Zero | None:
-    """Return the zero that was current at a sample; None if there was none."""
-    return Zero.set_in(step.estimate) if step.sample is not None else None
 
 
 def _compare(found: Mapping[str, Comparison], step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
