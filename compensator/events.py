@@ -284,6 +284,9 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
         Why the candidate cannot be used.
     needs : str
         What a person has to do.
+    off_at_zero : list of str, optional
+        Channels at whose 0 all that the candidate adds to the calibrated model adds nothing on a machine at rest; None
+        where it may.
     y_moved_utc_ns : int
         When measured Y last moved by itself, ns since 1970 UTC: a step of it was named, or a drift, which goes on to
         the end; 0 if none was.
@@ -305,6 +308,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     change_deviations: float | None = None
     refused: str = ""
     needs: str = ""
+    off_at_zero: list[str] | None = None
     y_moved_utc_ns: int = 0
     from_utc_ns: int = 0
     to_utc_ns: int = 0

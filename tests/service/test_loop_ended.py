@@ -64,7 +64,7 @@ def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() 
     (back,) = [seq for seq, step, _ in decisions(steps) if step == "back"]
     assert loop.effects == ("gain:DTF",) and ends < back < ends + DAY // 2
     notes = [note for step in steps for note in step.events if note.data.get("step") == "back"]
-    assert "back to the model without input:coolant_degc, which is better" in notes[0].text
+    assert "back to the model without input:coolant_degc, which alone is right about the zero" in notes[0].text
     # The diagnoses are as many as misfits and nights: what is no diagnosis is none of them.
     found = [note.data for step in steps for note in step.events if note.kind == "diagnosis"]
     assert len(night.asked) == sum(not data.get("without") for data in found)

@@ -15,12 +15,13 @@ import pytest
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.config import Loop
+from compensator.errors import DataError
 from compensator.events import ComparisonVerdict
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
 from compensator.service.loop import loop as loop_module
 from compensator.service.loop.compared import Compared
-from compensator.service.loop.level import ErrorBlocks
+from compensator.service.loop.level import ErrorBlocks, channels_at_zero
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.state import NO_VERDICT, Place
 from compensator.service.replay import opening_of
@@ -141,15 +142,79 @@ def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clea
 
 
 @pytest.mark.parametrize(
-    ("verdict", "every_h", "is_adopted"),
-    [("explained", 12, True), ("explained", 24, False), ("partly_explained", 12, False)],
+    ("later", "every_h", "record_h", "is_adopted"),
+    [
+        (shown(extended(2.9)), 12, 36, True),
+        (shown(extended(2.9), "partly_explained"), 12, 36, True),
+        (DataError("no result"), 12, 36, False),
+        (shown(extended(2.9)), 24, 24, False),  # its record begins where Y has moved
+    ],
 )
-def test_what_explains_most_of_a_record_without_a_drift_refutes_it(verdict, every_h, is_adopted):
-    """The beginning of an effect was called a drift; half a day later most of that record is explained without one."""
-    drifted, later = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS), shown(extended(2.9), verdict)
-    loop = LoopRun(settings(loop={"every_h": every_h}), QUILL_FILE, Night(drifted, *[later] * 9))
+def test_a_diagnosis_that_sees_the_time_and_finds_no_move_of_y_refutes_one(later, every_h, record_h, is_adopted):
+    """The beginning of an effect was called a drift; half a day later the record is explained without one."""
+    drifted = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
+    loop = LoopRun(settings(loop={"every_h": every_h, "record_h": record_h}), QUILL_FILE, Night(drifted, *[later] * 9))
     steps = run(loop, machine(3 * DAY), 2 * DAY)
     assert ("adopt" in [step for _, step, _ in decisions(steps)]) == is_adopted
+
+
+def test_newer_parameters_of_the_present_effects_show_no_level():
+    """What begins then is none of them: a mount that slips is no reason to raise their level."""
+    present, other = ([(n, 0.2 * (n % 2) if n < 12 else 9.0 + k * (n % 2)) for n in range(40)] for k in (1.0, 0.2))
+    other = [(n, 6.0 * (n % 2) if n < 12 else left) for n, left in other]
+    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place.error = ErrorBlocks(blocks=other)
+    shown_um = [
+        Compared(place, settings().loop, 60.0, ErrorBlocks(blocks=present), same=same).shown_level_um
+        for same in (False, True)
+    ]
+    assert shown_um[0] == pytest.approx(9.1, abs=0.2) and shown_um[1] is None
+
+
+@pytest.mark.parametrize(
+    ("off_at_zero", "zero_channels", "y_moved", "rms_um", "level_um"),
+    [
+        (["spindle_rpm"], ["spindle_rpm", "fan_rpm"], False, 3.9, 0.0),
+        (["spindle_rpm"], ["spindle_rpm"], False, 4.1, None),  # measured Y contradicts it
+        (["spindle_rpm"], ["spindle_rpm"], True, 7.9, 0.0),  # a mount has slipped
+        (["spindle_rpm"], ["spindle_rpm"], True, 8.1, None),
+        ([], [], False, 3.9, 0.0),  # a path of the heat
+        (["spindle_rpm"], ["fan_rpm"], False, 3.9, None),  # it turned at the zero
+        (["spindle_rpm"], None, False, 3.9, None),  # a zero on a warm machine
+        (None, ["spindle_rpm"], False, 3.9, None),
+    ],
+)
+def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
+    off_at_zero, zero_channels, y_moved, rms_um, level_um
+):
+    verdict = msgspec.structs.replace(NO_VERDICT, present_rms_um=4.0, candidate_rms_um=rms_um, measured_by="sensor")
+    place = Place(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
+    place.off_at_zero = off_at_zero
+    found = Compared(place, settings().loop, 60.0, ErrorBlocks(), y_moved=y_moved, zero_channels=zero_channels)
+    assert found.level_um == level_um
+
+
+def test_channels_that_read_0_at_a_zero_at_rest_are_known(tmp_path):
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    steps = run(loop, machine(600, change=lambda i, values: values.update(coolant_degc=0.0 if i < 300 else 20.0)), 200)
+    at_rest = next(step for step in steps if any(note.kind == "zero" for note in step.outcome.notes))
+    assert channels_at_zero(at_rest.outcome) == ["coolant_degc"] == loop._core.state.zero_channels
+    loop.compensation.zero("warm")
+    run(loop, machine(600), 2)
+    assert loop._core.state.zero_channels is None
+
+
+@pytest.mark.parametrize(
+    ("own_um", "other_um", "blocks", "is_right"),
+    [(20.0, 1.0, 8, True), (20.0, 1.0, 7, False), (20.0, 3.0, 8, False), (0.1, 0.1, 8, False)],
+)
+def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, other_um, blocks, is_right):
+    """An effect has ended on a machine at rest: nothing changes any longer that could show it."""
+    means = [(own_um + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(blocks)]
+    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
+    place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
+    found = Compared(place, settings().loop, 60.0, ErrorBlocks())
+    assert found.is_better_to_go_back_to(is_new=False) is is_right
 
 
 def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):

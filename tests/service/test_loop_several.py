@@ -136,7 +136,7 @@ class Stands:
     def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
         self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
         self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
-        self.level_at_return_um, self.goes_back = 0.0, True
+        self.level_at_return_um, self.goes_back, self.is_alone_right = 0.0, True, False
 
     def is_better_to_go_back_to(self, *, is_new: bool) -> bool:
         return self.goes_back

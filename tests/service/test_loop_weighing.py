@@ -9,7 +9,7 @@ from typing import Any
 from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.loop.weighing import difference, effect_names
+from compensator.service.loop.weighing import difference, effect_names, off_at_zero
 
 
 def coolant(gain: float) -> tuple[str, dict[str, Any]]:
@@ -35,6 +35,18 @@ def test_the_own_error_beside_a_named_effect_makes_no_other_explanation_of_it() 
     same, deviations = difference(again, first)
     assert same and math.isclose(deviations, 3.0)
     assert difference(extended(coolant(2.0)), first) == (True, 0.0)
+
+
+def test_what_is_off_at_rest_is_known_by_all_that_is_added() -> None:
+    gain, ambient = (("gain", {"path": path, "change": 0.2}) for path in ("DTF", "TDTF"))
+    joint = "hysteresis", {"path": "DTF", "form": "play", "half_width_um": 2.0}
+    base = extended()
+    assert off_at_zero(extended(gain, remainder("heat_w")), base) == []
+    assert off_at_zero(extended(gain, coolant(2.0)), base) == ["coolant_degc"]
+    assert off_at_zero(extended(coolant(2.0)), extended(coolant(1.0))) is None  # nothing is added
+    for other in (ambient, joint):
+        assert off_at_zero(extended(gain, other), base) is None
+    assert off_at_zero(extended(remainder("heat_w")), base) is None
 
 
 def test_parameters_of_two_time_constants_are_compared_one_by_one() -> None:

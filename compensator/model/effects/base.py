@@ -148,6 +148,15 @@ class Effect:
     explanation: str = ""
 
     @property
+    def off_at_zero(self) -> tuple[str, ...] | None:
+        """Channels at whose 0 the effect adds nothing on a machine at rest; None where it may.
+
+        About a zero at rest, with these channels at 0, its level is the same whether it acted then or began later. A
+        machine at rest has no heat.
+        """
+        return () if self.path in ("DTF", "TTF") else None
+
+    @property
     def label(self) -> str:
         """Name for people: its kind with the path and channel that it acts on."""
         return label_of({"kind": self.kind, **self.to_table()})

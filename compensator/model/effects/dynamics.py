@@ -88,6 +88,10 @@ class ChangedPaths(BankEffect, Effect):
     gain: tuple[float, ...] = numbers()
     gain_ambient: tuple[float, ...] = numbers()
 
+    @property
+    def off_at_zero(self) -> tuple[str, ...] | None:
+        return None  # that of the ambient changes, too
+
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         return (FilterBank(self.tau_min, (self.gain, self.gain_ambient), period_min),)
 

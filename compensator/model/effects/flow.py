@@ -48,6 +48,10 @@ class Flow(BankEffect, Effect):
     gain: tuple[float, ...] = numbers()
     gain_air: tuple[float, ...] = numbers()
 
+    @property
+    def off_at_zero(self) -> tuple[str, ...] | None:
+        return (self.channel,)
+
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         films = exchanges(self.half, self.surface_min, period_min)
         return *films, FromStart(), FromStart(), FilterBank(self.tau_min, (self.gain, self.gain_air), period_min)

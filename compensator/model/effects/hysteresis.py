@@ -30,6 +30,10 @@ class Hysteresis(Effect):
     form: str = text(*FORMS)
     half_width_um: float = number(0.0, 1e4)
 
+    @property
+    def off_at_zero(self) -> tuple[str, ...] | None:
+        return None  # a joint rests wherever it sticks
+
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         return ((Play if self.form == "play" else Stick)(self.half_width_um),)
 

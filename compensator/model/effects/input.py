@@ -47,6 +47,10 @@ class Input(BankEffect, Effect):
     gain: tuple[float, ...] = numbers()
     delay_min: float = number(0.0, 1440.0)
 
+    @property
+    def off_at_zero(self) -> tuple[str, ...] | None:
+        return (self.channel,)
+
     def blocks(self, period_min: float) -> tuple[Block, ...]:
         bank = FilterBank(self.tau_min, (self.gain,), period_min)
         return FromStart(), Delay(self.delay_min, period_min), bank

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from compensator.arrays import rms_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
@@ -12,8 +15,10 @@ from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
+    ALONE_PART,
     BETTER_PART,
     LEVEL_PART,
+    MOVED_PART,
     is_better_about_zero,
     is_better_to_go_back_to,
     is_clearly_better,
@@ -24,7 +29,7 @@ from compensator.service.loop.state import NO_VERDICT, Place
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
-from compensator.service.transfer.comparison import Comparison, changed
+from compensator.service.transfer.comparison import FEWEST, Comparison, changed
 from compensator.service.transfer.second_opinion import is_unusable
 
 
@@ -43,8 +48,12 @@ class Compared:
         Errors of the present model.
     alike : int
         Number of models in shadow with its role: they share the chance to be found better by accident.
-    y_drifted : bool
+    y_moved : bool
         Whether measured Y has moved by itself since the last zero: what is about the zero then shows no level.
+    zero_channels : list of str, optional
+        Channels that read 0 at the last zero; None where that was none at rest.
+    same : bool
+        Whether the present model has the same effects: what begins then is none of them, and shows no level of theirs.
     """
 
     def __init__(
@@ -55,10 +64,12 @@ class Compared:
         present_error: ErrorBlocks,
         *,
         alike: int = 1,
-        y_drifted: bool = False,
+        y_moved: bool = False,
+        zero_channels: Sequence[str] | None = None,
+        same: bool = False,
     ) -> None:
         self._place, self._settings, self._present_error = place, settings, present_error
-        self._alike, self._y_drifted = alike, y_drifted
+        self._alike, self._y_moved, self._same, self._zero_channels = alike, y_moved, same, zero_channels
         self._period_s, self._comparison = period_s, Comparison(period_s, place.comparison)
 
     @property
@@ -140,10 +151,26 @@ class Compared:
             it is the calibrated model, whose own level is right.
         """
         found, residuals_um = self._place.verdict, self._comparison.residuals_um
+        if self.is_alone_right:
+            return True
         if is_new and self._place.effects and residuals_um:
             left_um = [other - self.level_at_return_um for _, _, other in residuals_um]
             found = changed(found, candidate_rms_um=math.hypot(*left_um) / math.sqrt(len(left_um)))
         return is_better_to_go_back_to(found) and self._is_itself_better
+
+    @property
+    def is_alone_right(self) -> bool:
+        """Whether only the other model is right about the zero, for hours in which its changes are no worse.
+
+        Where an effect has ended on a machine at rest, nothing changes any longer. That measured Y had moved by itself
+        to where the other model happens to be right is as unlikely as its error is small beside that of the present.
+        """
+        residuals_um, found = self._comparison.residuals_um, self._place.verdict
+        if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
+            return False
+        own_um = rms_of(np.array([own for _, own, _ in residuals_um]))
+        other_um = rms_of(np.array([other for _, _, other in residuals_um]))
+        return other_um <= ALONE_PART * own_um and other_um > 0.0
 
     @property
     def _is_itself_better(self) -> bool:
@@ -160,6 +187,8 @@ class Compared:
     @property
     def shown_level_um(self) -> float | None:
         """The level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
+        if self._same:
+            return None
         since_ns = self._place.level_utc_ns or self._place.since_utc_ns
         return level_um(self._present_error.blocks, self._place.error.blocks, since_ns=since_ns)
 
@@ -198,16 +227,21 @@ class Compared:
     def level_um(self) -> float | None:
         """By how much a candidate's level is raised at its adoption, µm; None if its level is not known.
 
+        What adds nothing on a machine at rest has the level of a zero at rest, unless measured Y contradicts it and has
+        not moved by itself.
         Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
         that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
         which of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right
         level: what follows the mount is better, too.
         """
-        shown_um, verdict = self.shown_level_um, self._place.verdict
+        verdict, off = self._place.verdict, self._place.off_at_zero
+        if off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels):
+            return 0.0 if is_better_about_zero(verdict, MOVED_PART if self._y_moved else 1.0) else None
+        shown_um = self.shown_level_um
         is_probed = verdict.measured_by == "probe"
         part = BETTER_PART if is_probed else LEVEL_PART
         # What creeps beside probes both models are corrected for, and few values often look like a drift.
-        shows_level = is_probed or not self._y_drifted
+        shows_level = is_probed or not self._y_moved
         if shown_um is None and shows_level and is_better_about_zero(verdict, part):
             return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um

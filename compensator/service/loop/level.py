@@ -20,7 +20,7 @@ from compensator.arrays import rms_of
 from compensator.diagnose.change import BLOCK_MIN, FEWEST, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
-from compensator.service.outcome import Outcome, sets_zero
+from compensator.service.outcome import Outcome, sets_zero, sets_zero_at_rest
 from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.evidence import FLOOR_UM
 
@@ -34,6 +34,8 @@ STAYS, SPREAD = 0.25, 0.3
 _MOST = 2.0
 #: Blocks that show a constant: they differ by no more than `SPREAD` of it.
 _CONSTANT = 12
+#: A channel reads 0 if its mean is no more than so many standard deviations within the sample.
+_NOISE = 3.0
 #: Blocks that are remembered.
 _BLOCKS = 144
 
@@ -76,6 +78,16 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
     def clear(self) -> None:
         """Begin anew: at a zero, or with another model."""
         self.blocks, self.count, self.sum_um = [], 0, 0.0
+
+
+def channels_at_zero(outcome: Outcome) -> list[str] | None:
+    """Return the channels that read 0, within their noise, at a sample that sets a zero; None if not one at rest."""
+    if not sets_zero_at_rest(outcome):
+        return None
+    read = (
+        (name, number(one.mean), number(one.spread)) for name, one in outcome.sample.channels.items() if one.is_good
+    )
+    return [name for name, mean, spread in read if abs(mean) <= _NOISE * spread]
 
 
 def is_constant(blocks: Sequence[tuple[int, float]]) -> bool:

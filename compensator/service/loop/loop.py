@@ -23,7 +23,7 @@ from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
-from compensator.service.loop.level import ErrorBlocks, is_constant
+from compensator.service.loop.level import ErrorBlocks, channels_at_zero, is_constant
 from compensator.service.loop.misfit import count_misfit
 from compensator.service.loop.place import (
     falls,
@@ -51,6 +51,8 @@ from compensator.service.transfer.second_opinion import described
 #: No decision before no sensor has been suspected for so long, no diagnosis before none has shown a fault by itself;
 #: and a candidate ends that has been at a limit for so long, min.
 CLEAN_MIN = BLOCK_MIN
+#: A diagnosis sees whether measured Y has moved where this part of its record lies before that time, and after it.
+_SEEN = 0.25
 
 
 class Loop:
@@ -86,8 +88,17 @@ class Loop:
         """Return what is compared of a model in shadow and the present one."""
         state = self.state
         alike = sum(one.role == place.role for one in state.taken)
-        has_drifted = state.y_drifted_ns > 0
-        return Compared(place, self._settings, self._period_s, state.error, alike=max(alike, 1), y_drifted=has_drifted)
+        has_moved = state.y_moved_ns > 0
+        return Compared(
+            place,
+            self._settings,
+            self._period_s,
+            state.error,
+            alike=max(alike, 1),
+            y_moved=has_moved,
+            zero_channels=state.zero_channels,
+            same=same_effects(place.effects, state.effects),
+        )
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured; None: it is not known how many, and they count as none."""
@@ -125,7 +136,7 @@ class Loop:
                 self.compared(place).forget_before(now_ns - round(state.misfit_min * 60 * NS))
         state.error.update(present)
         if sets_zero(present):
-            state.zero_utc_ns, state.y_drifted_ns = now_ns, 0
+            state.zero_utc_ns, state.y_moved_ns, state.zero_channels = now_ns, 0, channels_at_zero(present)
         notes = self._forget_wrong() if was_wrong(present) else []
         notes += self._wait(present, others, is_suspected=suspected)
         judged: list[Place] = []
@@ -232,10 +243,11 @@ class Loop:
         return f"{_named(place)}{', newer parameters of the present effects' if is_known else ''}"
 
     def _go_back(self, place: Place) -> list[Note]:
-        notes = decide_exchange(self.state, "back", place, self.compared)
         ended = [one for one in self.state.effects if one not in place.effects]
         to = "the model before" if place is self.state.watched else f"the model without {named(ended)}"
-        text = f"back to {to}, which is better: {_named(place)}; {described(place.verdict)}"
+        which = "which alone is right about the zero" if self.compared(place).is_alone_right else "which is better"
+        text = f"back to {to}, {which}: {_named(place)}; {described(place.verdict)}"
+        notes = decide_exchange(self.state, "back", place, self.compared)
         return [*notes, note_of(self.state, place, LoopAction.BACK, text)]
 
     # ------------------------------------------------------------------ diagnoses
@@ -264,16 +276,16 @@ class Loop:
         return [nothing_follows(why, found)] if why else []
 
     def _judge_y(self, found: DiagnosisData, running: Running) -> None:
-        """Remember that measured Y has moved by itself, until what explains most of that record finds it has not.
+        """Remember that measured Y has moved by itself, until a diagnosis that sees the time finds that it has not.
 
         Where an effect begins in a record, it may look like a step or a drift of Y until there is more of it. What had
         moved before the last zero is in that zero.
         """
-        half_ns = round(0.5 * self._settings.record_h * HOUR_NS)
+        seen_ns, moved_ns = round(_SEEN * self._settings.record_h * HOUR_NS), self.state.y_moved_ns
         if found.y_moved_utc_ns > self.state.zero_utc_ns:
-            self.state.y_drifted_ns = running.to_utc_ns
-        elif found.verdict == "explained" and running.from_utc_ns <= self.state.y_drifted_ns - half_ns:
-            self.state.y_drifted_ns = 0
+            self.state.y_moved_ns = min(found.y_moved_utc_ns, running.to_utc_ns)
+        elif found.verdict != "failed" and running.from_utc_ns + seen_ns <= moved_ns <= running.to_utc_ns - seen_ns:
+            self.state.y_moved_ns = 0
 
     def begin(self) -> list[Note]:
         """Say that what is warmed up gets a place before the next sample, and what gives its own for it; or nothing.
@@ -309,6 +321,8 @@ class Loop:
         state, before = self.state, with_effects(self.state, role, effects)
         place = Place(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
         place.error = error if error is not None else ErrorBlocks()
+        if state.diagnosis is not None and state.diagnosis.found is not None:
+            place.off_at_zero = state.diagnosis.found.off_at_zero
         if before is not None:
             self.compared(place).go_on_with(before, now_ns)
             place.is_proposed = before.is_proposed  # a person is asked for the same: a zero

@@ -12,9 +12,14 @@ BETTER_PART = 0.95
 #: A candidate whose level nothing else shows must be wrong by less than this part about the zero of a displacement
 #: sensor: a level of its own that is as wrong as the present one's gives a few percent by chance. Probes correct both.
 LEVEL_PART = 0.8
+#: One that adds nothing at rest, about a zero at rest, must be no more wrong about it than the present one; where
+#: measured Y has moved by itself, which may hide the error of either, than so many times as much.
+MOVED_PART = 2.0
 #: What diagnoses have found runs in so many places at once. The diagnoses of simulated weeks name two or three
 #: explanations by turns; each costs processor time, and what the others must show (`shared`).
 CANDIDATES = 3
+#: A model that leaves less than this part of the present one's error about the zero is right, and that one is not.
+ALONE_PART = 0.1
 #: The service does not go back where the present model is wrong about the zero by less than this part.
 _BACK_PART = 0.5
 

@@ -15,7 +15,7 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.transfer.comparison import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 5
+STATE_SCHEMA = 6
 
 #: A candidate may be adopted; to a model from before, or with fewer effects, the service goes back.
 Role = Literal["candidate", "before"]
@@ -84,6 +84,8 @@ class Place(msgspec.Struct, kw_only=True):
         Its errors since the last zero, on the record before the comparison, too.
     limited_min : float
         For how long it has been at a limit that the present model keeps, min.
+    off_at_zero : list of str, optional
+        `DiagnosisData.off_at_zero`.
     """
 
     sha256: str
@@ -96,6 +98,7 @@ class Place(msgspec.Struct, kw_only=True):
     verdict: ComparisonData = NO_VERDICT
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     limited_min: float = 0.0
+    off_at_zero: list[str] | None = None
 
     def begin_anew(self) -> None:
         """Forget what was compared."""
@@ -165,9 +168,11 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         Errors of the present model since the last zero.
     zero_utc_ns : int
         Time of the last zero, ns since 1970 UTC; 0 before.
-    y_drifted_ns : int
-        End of the record on which a diagnosis since then has found that measured Y had moved by itself, ns since 1970
-        UTC; 0: none has, or a later one that explains most of that record has not.
+    zero_channels : list of str, optional
+        Channels that read 0 at that zero; None where it was none at rest.
+    y_moved_ns : int
+        When measured Y has moved by itself since then, as a diagnosis has found, ns since 1970 UTC; 0: none has, or a
+        later one that sees that time has not.
     avoided : list of Avoided
         Models that were gone back from or dismissed.
     """
@@ -196,7 +201,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     base_effects: list[str] = []
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     zero_utc_ns: int = 0
-    y_drifted_ns: int = 0
+    zero_channels: list[str] | None = None
+    y_moved_ns: int = 0
     avoided: list[Avoided] = []
 
     @property
@@ -234,7 +240,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         self.diagnosed_utc_ns = moved(self.diagnosed_utc_ns, by_ns)
         self.left_out_utc_ns = moved(self.left_out_utc_ns, by_ns)
         self.zero_utc_ns = moved(self.zero_utc_ns, by_ns)
-        self.y_drifted_ns = moved(self.y_drifted_ns, by_ns)
+        self.y_moved_ns = moved(self.y_moved_ns, by_ns)
         self.uncompared_ns = moved(self.uncompared_ns, by_ns)
         self.adopted_utc_ns = moved(self.adopted_utc_ns, by_ns)
         self.probes_shown = [(at_ns + by_ns, shown) for at_ns, shown in self.probes_shown]

@@ -139,8 +139,19 @@ def weigh(found: Diagnosed, config: Config, *, calibrated: bytes, present: Therm
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
         calibrated=model.sha256 == base.sha256,
+        off_at_zero=off_at_zero(model, base),
     )
     return Weighed(weighed, data)
+
+
+def off_at_zero(model: ThermalModel, base: ThermalModel) -> list[str] | None:
+    """Return with which channels at 0 all that a model adds to another one is off at rest; None where it may not be."""
+    known = [name_of(effect) for effect in _known_by(base)]
+    added = [effect.off_at_zero for effect in _known_by(model) if name_of(effect) not in known]
+    channels = [each for each in added if each is not None]
+    if not added or len(channels) < len(added):
+        return None
+    return sorted({channel for each in channels for channel in each})
 
 
 def _candidate_of(found: Diagnosed, calibrated: bytes, *, is_extended: bool) -> bytes | None:
