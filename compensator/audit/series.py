@@ -306,6 +306,8 @@ class _Series:
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         files = [file for file in files if file.is_recording]
         self._names = {file.original: file for file in files}
+        #: What continues a file that the recorder gave up, which is then none that a kill has left.
+        self._after_failure = {(file.machine, file.previous_file): file for file in files if file.began == "failure"}
         self._emptied = {file.file for file in _perhaps_emptied(files)}
         self._first_of: dict[tuple[str, str], str] = {}
         self._removed = {name for file in files for name in file.removed}
@@ -342,10 +344,16 @@ class _Series:
             return
         if file.not_replayed:
             remark(Remark(AuditRemark.NOT_REPLAYED, f"{name}: not all samples were replayed: {file.not_replayed}."))
+        after = self._after_failure.get(created)
+        cause = "the service was killed"
+        if after is not None:
+            cause = (
+                f"the disk did not accept what followed, and the service went on in {after.file}, whose events say why"
+            )
         if file.end == RecordingEnd.RECOVERED:
-            remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every complete record was kept."))
+            remark(Remark(RecordingEnd.RECOVERED, f"{name}: {cause}; every complete record was kept."))
         elif file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
-            figures = f"{name}: no end; it is still being written, or the service was killed"
+            figures = f"{name}: no end; {'it is still being written, or ' if after is None else ''}{cause}"
             if self._newest[file.machine] == name:
                 figures += "; the next file shows whether records are missing, as it contains this file's last value"
             if file.end == RecordingEnd.TORN:
