@@ -292,6 +292,15 @@ BAD_CONFIGS = [
     ('mode = "peer"', "mode = 3", "zenoh.mode = 3: expected one of: peer, client, router"),
     ("[machine]", '[loop]\npolicy = "adopt"\nat_utc = "25:00"\n[machine]', "loop.at_utc = '25:00'"),
     ("[machine]", "[loop]\nshadow_h = 1.0\n[machine]", "loop.shadow_h = 1.0"),
+    ('name = "vmc-07"', 'name = "vmc-07\\n"', "machine.name = 'vmc-07\\n': has a control character"),
+    ('name = "y_um"', 'name = "y_um\\n"', "].name = 'y_um\\n': has a control character"),
+    ('device = "probe"', 'device = "probe\\n"', "].device = 'probe\\n': has a control character"),
+    ('prefix = "shop/sim"', 'prefix = "shop/sim\\n"', "zenoh.prefix = 'shop/sim\\n': has a control character"),
+    (
+        'folder = "recordings"',
+        'folder = "recordings\\n"',
+        "recording.folder = 'recordings\\n': has a control character",
+    ),
     ("[machine]", PROBE_TABLE + "often = true\n[machine]", "probe.often: no such key, expected one of: std_um"),
 ]
 
