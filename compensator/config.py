@@ -217,6 +217,20 @@ class Loop(_Table, frozen=True, kw_only=True):
         return 60 * int(hours) + int(minutes)
 
 
+#: What zenoh opens by its form; whether the host or the folder is there, only the start of the service can tell.
+_PORT = r"0*(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5]?[0-9]{1,4})"
+_ENDPOINT = (
+    rf"^((tcp|tls|quic|udp|ws)/(\[[^\s\]?#]+\]|[^\s\[\]/?#]*[^\s\[\]/?#:]):{_PORT}|unixsock-stream/[^?#]+)"
+    r"(\?[^?#]+)?(#[^?#]+)?\Z"
+)
+Endpoint = Annotated[
+    str,
+    Meta(
+        pattern=_ENDPOINT, max_length=4096, examples=["tcp/127.0.0.1:7447", "tcp/[::1]:7447, with a port up to 65535"]
+    ),
+]
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset is published. The service listens only on endpoints that are given here.
 
@@ -230,8 +244,8 @@ class Zenoh(_Table, frozen=True, kw_only=True):
         str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*\Z", max_length=200, examples=["shop/vmc-07"])
     ]
     mode: Literal["peer", "client", "router"] = "peer"
-    listen: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
-    connect: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
+    listen: Annotated[list[Endpoint], Meta(max_length=50)] = msgspec.field(default_factory=list)
+    connect: Annotated[list[Endpoint], Meta(max_length=50)] = msgspec.field(default_factory=list)
     tls_ca: Text | None = None
     tls_certificate: Text | None = None
     tls_key: Text | None = None
