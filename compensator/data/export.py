@@ -19,6 +19,7 @@ from msgspec import UNSET
 from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
 from compensator.data.files import measured_probes
+from compensator.data.table import MEASURED_HEAT, QUALITY
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets, named_for, topic_of
@@ -155,8 +156,8 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
             # A mean that the guards refused is missing from the table; the quality says why.
-            cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.is_good else None
-            cells[f"{name}_quality"] = channel.quality
+            cells[MEASURED_HEAT if name == "heat_w" else name] = channel.mean if channel.is_good else None
+            cells[f"{name}{QUALITY}"] = channel.quality
         return cells
     if isinstance(message, AxisOffset) and message.axis != FIRST:
         return cells | _axis_cells(message)
