@@ -83,11 +83,11 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
             if isinstance(message, Sample):
                 middles[message.seq] = message.time_utc_ns - message.behind_ns, round(0.5e9 * message.period_s)
             rows.setdefault(message.seq, {}).update(_cells(message))
+        if len(machines) > 1:  # before their numbers are compared: those of two machines may be the same
+            (one, first), (other, second) = list(machines.items())[:2]
+            raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
-    if len(machines) > 1:
-        (one, first), (other, second) = list(machines.items())[:2]
-        raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
     rows = dict(sorted(rows.items()))
     _add_probes(str(paths[0]), rows, probes, middles)
     start = min(row["_ns"] for row in rows.values())

@@ -67,6 +67,7 @@ def test_several_recordings_are_one_table_in_the_order_of_their_samples(
     for words, expected in (
         ([first, first], "no samples in it that the files before it have not"),
         ([first, other_machine(second, tmp_path / "other.mcap")], "expected recordings of one machine"),
+        ([second, tmp_path / "other.mcap"], "expected recordings of one machine"),  # with the same numbers
     ):
         assert main(["export", *map(str, words), "--out", str(tmp_path / "none.csv")]) == 2
         assert expected in capsys.readouterr().err and not (tmp_path / "none.csv").exists()
