@@ -87,6 +87,14 @@ def test_toml_that_takes_long(text: bytes, words: str) -> None:
             parse(text, source="x.toml")
 
 
+def test_toml_may_begin_with_the_mark_of_an_editor() -> None:
+    mark = "\ufeff".encode()
+    assert parse_config(mark + CONFIG, source="x.toml") == parse_config(CONFIG, source="x.toml")
+    assert parse_toml(mark + b"a = 1") == {"a": 1}
+    with pytest.raises(ConfigError, match="Invalid statement"):
+        parse_config(CONFIG + mark, source="x.toml")
+
+
 @pytest.mark.parametrize("nested", ["[", '{"a":'])
 def test_a_configuration_of_zenoh_that_is_nested_deeply(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], nested: str
