@@ -959,17 +959,17 @@ class RecordingEnd(Code):
     FINISHED = "finished", "The recording is complete: sealed, with checksums and index.", "Nothing."
     RECOVERED = (
         "recovered",
-        "The service was killed; the next start kept every complete record and sealed the file.",
-        "Find out why the machine or the service stopped.",
+        "The file had no end, as after a kill or on a full disk: every complete record was kept and sealed later.",
+        "Find out why the machine, the service or the disk stopped; the next recording has the events.",
     )
     OPEN = (
         "open",
-        "The recording has no end: it is still being written, or the service was killed.",
+        "The recording has no end: it is still being written, or as after a kill or on a full disk.",
         "Audit it again with the next recording, which contains the last value of its hash chain.",
     )
     TORN = (
         "torn",
-        "The recording ends within a group of records: it is still being written, or the service was killed.",
+        "The recording ends within a group of records: it is being written, or as after a kill or on a full disk.",
         "Audit it again with the next recording, which contains the last value of its hash chain.",
     )
 

@@ -27,6 +27,7 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
 #: Limits of the rate of a temperature, K/min, and the temperatures that any part of a machine can have, °C.
 _RATES, _TEMPERATURES = (0.001, 10_000.0), (-273.15, 2000.0)
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 #: Largest magnitude of a value of a channel of any unit.
 _VALUE_MAX = 1e12
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
@@ -65,7 +66,7 @@ class Channel(_Table, frozen=True, kw_only=True):
     The limits are optional for auxiliary channels and required for T_Q, AT and Y.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$", examples=["t_q_degc", "coolant_degc"])]
+    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}\Z", examples=["t_q_degc", "coolant_degc"])]
     device: Text
     input: Annotated[int, Meta(ge=0, le=65535)]
     range: tuple[float, float] | None = None
@@ -193,7 +194,7 @@ class Loop(_Table, frozen=True, kw_only=True):
     """
 
     policy: Literal["off", "propose", "adopt"] = "off"
-    at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", examples=["02:00", "14:30"])] = "02:00"
+    at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]\Z", examples=["02:00", "14:30"])] = "02:00"
     every_h: Literal[4, 6, 8, 12, 24] = 6
     misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 3.0
     record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
@@ -216,6 +217,20 @@ class Loop(_Table, frozen=True, kw_only=True):
         return 60 * int(hours) + int(minutes)
 
 
+#: What zenoh opens by its form; whether the host or the folder is there, only the start of the service can tell.
+_PORT = r"0*(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5]?[0-9]{1,4})"
+_ENDPOINT = (
+    rf"^((tcp|tls|quic|udp|ws)/(\[[^\s\]?#]+\]|[^\s\[\]/?#]*[^\s\[\]/?#:]):{_PORT}|unixsock-stream/[^?#]+)"
+    r"(\?[^?#]+)?(#[^?#]+)?\Z"
+)
+Endpoint = Annotated[
+    str,
+    Meta(
+        pattern=_ENDPOINT, max_length=4096, examples=["tcp/127.0.0.1:7447", "tcp/[::1]:7447, with a port up to 65535"]
+    ),
+]
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset is published. The service listens only on endpoints that are given here.
 
@@ -226,11 +241,11 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     """
 
     prefix: Annotated[
-        str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", max_length=200, examples=["shop/vmc-07"])
+        str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*\Z", max_length=200, examples=["shop/vmc-07"])
     ]
     mode: Literal["peer", "client", "router"] = "peer"
-    listen: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
-    connect: Annotated[list[Text], Meta(max_length=50)] = msgspec.field(default_factory=list)
+    listen: Annotated[list[Endpoint], Meta(max_length=50)] = msgspec.field(default_factory=list)
+    connect: Annotated[list[Endpoint], Meta(max_length=50)] = msgspec.field(default_factory=list)
     tls_ca: Text | None = None
     tls_certificate: Text | None = None
     tls_key: Text | None = None
@@ -368,8 +383,8 @@ def parse_config(data: bytes, *, source: str) -> Config:
         table = parse_toml(data)
     except ValueError as error:
         raise ConfigError(f"{source}: not a TOML file: {error}") from error
-    if (place := _with_nul(table)) is not None:
-        raise ConfigError(f"{source}: {place}: contains \\u0000, expected a text without it")
+    if (place := _with_control(table)) is not None:
+        raise ConfigError(f"{source}: {place}: has a control character, such as a line end, expected a text without")
     try:
         config = msgspec.convert(with_limits_of_y(table), Config)
     except msgspec.ValidationError as error:
@@ -383,14 +398,14 @@ def parse_config(data: bytes, *, source: str) -> Config:
     return config
 
 
-def _with_nul(value: Any, where: str = "") -> str | None:
-    """Return the place of a text with the character 0, which no file, port or host can have in its name."""
+def _with_control(value: Any, where: str = "") -> str | None:
+    """Return place and value of a text with a control character, which no name should have."""
     if isinstance(value, str):
-        return where if "\0" in value else None
+        return f"{where} = {value[:60]!r}" if _CONTROL.search(value) else None
     if not isinstance(value, (dict, list)):
         return None
     items = value.items() if isinstance(value, dict) else ((f"[{i}]", one) for i, one in enumerate(value))
-    found = (_with_nul(one, f"{where}.{key}".lstrip(".").replace(".[", "[")) for key, one in items)
+    found = (_with_control(one, f"{where}.{key}".lstrip(".").replace(".[", "[")) for key, one in items)
     return next((place for place in found if place is not None), None)
 
 

@@ -26,7 +26,7 @@ MicrometresPerMPerMin = Annotated[float, Meta(ge=0.001, le=1000)]
 Distance = Annotated[float, Meta(ge=1, le=20_000)]
 #: Of an axis' position, or of a tool.
 Position = Annotated[float, Meta(ge=-50_000, le=50_000)]
-Part = Annotated[str, Meta(pattern=f"^{NAME.pattern}$")]
+Part = Annotated[str, Meta(pattern=rf"^{NAME.pattern}\Z")]
 
 
 class Slope(Table, frozen=True, kw_only=True):

@@ -16,7 +16,8 @@ Minutes = Annotated[float, Meta(ge=0.01, le=100_000)]
 #: Of a channel of any unit, such as rpm/min.
 Rate = Annotated[float, Meta(ge=1e-9, le=1e9)]
 Text = Annotated[str, Meta(min_length=1, max_length=4096)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", examples=["vmc-07"])]
+#: `$` would accept a line end after the last character, here as in every other pattern.
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z", examples=["vmc-07"])]
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

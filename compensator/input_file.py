@@ -120,7 +120,7 @@ def parse_toml(data: bytes) -> dict[str, Any]:
     if any(lexeme["deep"] for lexeme in _LEXEME.finditer(data)):
         raise ValueError(f"a key of more than {KEY_PARTS} parts")
     try:
-        return tomllib.loads(data.decode("utf-8"))
+        return tomllib.loads(data.decode("utf-8-sig"))  # editors on Windows begin a file with a mark
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 

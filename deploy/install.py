@@ -215,7 +215,7 @@ class Installation:
             lines = done.stderr.strip().splitlines() or ["no answer"]
             raise InstallError(f"{version.name} cannot use {config}: {lines[-1]}")
         name = config.parent.name
-        table = tomllib.loads(read(config).decode())
+        table = tomllib.loads(read(config).decode("utf-8-sig"))
         folder = (Path(CONFIGURATIONS) / name / table["recording"]["folder"]).as_posix()
         if not os.path.normpath(folder).startswith(f"{RECORDINGS}/{name}/"):
             raise InstallError(

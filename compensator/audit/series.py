@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,11 @@ class Audit:
     def chained(self) -> list[RecordingAudit]:
         """Files with a hash chain."""
         return [file for file in self.files if file.last]
+
+    @property
+    def perhaps_emptied(self) -> list[RecordingAudit]:
+        """Files without a record at the end of a machine's; no later one shows that they never held any."""
+        return _perhaps_emptied(self.files)
 
     @property
     def clean(self) -> bool:
@@ -285,6 +290,14 @@ def _started(original: str) -> tuple[str, int]:
     return order_of(original.removesuffix(".mcap").rpartition("_")[2]) if named_of(original) else ("", 0)
 
 
+def _perhaps_emptied(files: Sequence[RecordingAudit]) -> list[RecordingAudit]:
+    """Return the files behind the last record of each machine; `files` are in order."""
+    found: list[RecordingAudit] = []
+    for _, of_machine in groupby((file for file in files if file.is_recording), key=lambda file: file.machine):
+        found += takewhile(lambda file: not file.last, reversed(list(of_machine)))
+    return found
+
+
 class _Series:
     """Checks files one after the other, and the links between them."""
 
@@ -293,6 +306,9 @@ class _Series:
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         files = [file for file in files if file.is_recording]
         self._names = {file.original: file for file in files}
+        #: What continues a file that the recorder gave up, which is then none that a kill has left.
+        self._after_failure = {(file.machine, file.previous_file): file for file in files if file.began == "failure"}
+        self._emptied = {file.file for file in _perhaps_emptied(files)}
         self._first_of: dict[tuple[str, str], str] = {}
         self._removed = {name for file in files for name in file.removed}
         begun = [file for file in files if file.last] or files
@@ -317,15 +333,27 @@ class _Series:
         if created in self._first_of:
             self._find(Fault.COPIED, file, other=self._first_of[created], original=file.original)
         self._first_of.setdefault(created, name)
+        if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
+            words = f"{name}: ends before the first record"
+            if name in self._emptied:
+                words += (
+                    f" ({file.size} bytes), and no later file shows that it never held one: a kill as a file begins "
+                    "leaves such a one, and so does somebody who empties it"
+                )
+            remark(Remark(RecordingEnd.TORN, f"{words}."))
+            return
         if file.not_replayed:
             remark(Remark(AuditRemark.NOT_REPLAYED, f"{name}: not all samples were replayed: {file.not_replayed}."))
-        if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
-            remark(Remark(RecordingEnd.TORN, f"{name}: ends before the first record."))
-            return
+        after = self._after_failure.get(created)
+        cause = "the service was killed"
+        if after is not None:
+            cause = (
+                f"the disk did not accept what followed, and the service went on in {after.file}, whose events say why"
+            )
         if file.end == RecordingEnd.RECOVERED:
-            remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every complete record was kept."))
+            remark(Remark(RecordingEnd.RECOVERED, f"{name}: {cause}; every complete record was kept."))
         elif file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
-            figures = f"{name}: no end; it is still being written, or the service was killed"
+            figures = f"{name}: no end; {'it is still being written, or ' if after is None else ''}{cause}"
             if self._newest[file.machine] == name:
                 figures += "; the next file shows whether records are missing, as it contains this file's last value"
             if file.end == RecordingEnd.TORN:
@@ -454,7 +482,8 @@ def summary(found: Audit) -> str:
         lines += found.difference.lines() if found.difference else []
     if found.chained and not found.findings_count:
         records = sum(file.records for file in found.chained)
-        lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
+        between = "between the first and the last of them nothing was changed, removed, inserted or moved"
+        lines.append(f"The hash chain holds over {records} records; {between}.")
         if not found.signed:
             lines.append(
                 "Anyone who can write all of these files can compute a new chain; only a signature, checked "

@@ -18,10 +18,13 @@ def verdict(found: Audit) -> str:
         if found.differing:
             wrong.append(f"{found.differing} sample(s) that differ in the replay")
         return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
-    if not found.samples:
-        return f"Proven in part: the records of {files} are unchanged; none of them is a sample."
     if partly(found):
-        return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
+        emptied = len(found.perhaps_emptied)
+        unknown = f"; {emptied} of them without a record, which may have been removed" if emptied else ""
+        if not found.samples:
+            return f"Proven in part: the records of {files} are unchanged; none of them is a sample{unknown}."
+        unknown = unknown or "; see what was not checked"
+        return f"Proven in part: the replay reproduces {found.samples} samples of {files}{unknown}."
     words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
     if not found.signed:
         return words + "; no signature was checked."

@@ -15,6 +15,7 @@ import msgspec
 
 from compensator.codes import State
 from compensator.commands.stopping import on_stop
+from compensator.errors import ServiceError
 from compensator.events import EventKind
 from compensator.messages import Event, Offset
 from compensator.messages_axes import OFFSETS, SHOWN_UNITS, UNITS, AxisOffset, axis_of
@@ -125,18 +126,21 @@ def run(arguments: argparse.Namespace) -> None:
     Raises
     ------
     CompensatorError
-        If the configuration cannot be used, or the service cannot start.
+        If the configuration cannot be used, the service cannot start, or it ends with samples that are not on disk.
     """
     # The watchdog ends the service by SIGABRT; the log then shows the current line of each thread.
     faulthandler.enable()
     if systemd.is_connected(os.environ, sys.stderr.fileno()):
         logging.basicConfig(handlers=[systemd.JournalHandler()], format="%(message)s", force=True)
     with ServiceManager(os.environ) as manager:
-        asyncio.run(_serve(arguments.config, manager))
+        unfinished = asyncio.run(_serve(arguments.config, manager))
+    if unfinished:
+        raise ServiceError(f"stopped; the recording is not complete: {unfinished}")
     log.info("compensator: stopped, recording finished")
 
 
-async def _serve(path: str, manager: ServiceManager) -> None:
+async def _serve(path: str, manager: ServiceManager) -> str:
+    """Serve; return what of the recording is not on disk at the end."""
     reporter = Reporter(manager)
     manager.status("starting: reading the last recording")
     setup = load(path)
@@ -151,4 +155,5 @@ async def _serve(path: str, manager: ServiceManager) -> None:
         manager.status("starting: waiting for the first poll")
         log.info("compensator: running")
 
-    await run_service(setup, on_ready=ready, on_poll=reporter.report_poll, on_publish=reporter.report_message)
+    daemon = await run_service(setup, on_ready=ready, on_poll=reporter.report_poll, on_publish=reporter.report_message)
+    return daemon.unfinished

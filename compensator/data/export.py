@@ -19,6 +19,7 @@ from msgspec import UNSET
 from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
 from compensator.data.files import measured_probes
+from compensator.data.table import MEASURED_HEAT, QUALITY
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets, named_for, topic_of
@@ -82,11 +83,11 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
             if isinstance(message, Sample):
                 middles[message.seq] = message.time_utc_ns - message.behind_ns, round(0.5e9 * message.period_s)
             rows.setdefault(message.seq, {}).update(_cells(message))
+        if len(machines) > 1:  # before their numbers are compared: those of two machines may be the same
+            (one, first), (other, second) = list(machines.items())[:2]
+            raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
-    if len(machines) > 1:
-        (one, first), (other, second) = list(machines.items())[:2]
-        raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
     rows = dict(sorted(rows.items()))
     _add_probes(str(paths[0]), rows, probes, middles)
     start = min(row["_ns"] for row in rows.values())
@@ -155,8 +156,8 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
             # A mean that the guards refused is missing from the table; the quality says why.
-            cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.is_good else None
-            cells[f"{name}_quality"] = channel.quality
+            cells[MEASURED_HEAT if name == "heat_w" else name] = channel.mean if channel.is_good else None
+            cells[f"{name}{QUALITY}"] = channel.quality
         return cells
     if isinstance(message, AxisOffset) and message.axis != FIRST:
         return cells | _axis_cells(message)

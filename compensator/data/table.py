@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -45,6 +45,8 @@ EXPORTED = (
     "state",
     "reasons",
 )
+#: A measured heat in an exported recording, where `heat_w` is the estimate, and what follows a channel's name there.
+MEASURED_HEAT, QUALITY = "heat_measured_w", "_quality"
 #: The same of further axes, tilts and slopes.
 _EXPORTED_AXES = re.compile(
     r"[xzab]_(state|reasons|(dtf|tdtf|pred|std|ref|residual|offset|offset_std)_(um|urad)"
@@ -61,6 +63,25 @@ def is_computed(name: str) -> bool:
     (True, True, False)
     """
     return name in EXPORTED or _EXPORTED_AXES.fullmatch(name) is not None
+
+
+def is_taken(name: str, channels: Collection[str]) -> bool:
+    """Return whether the column of a channel would be lost in a table: the name has another meaning there.
+
+    Parameters
+    ----------
+    name : str
+        Name of the channel.
+    channels : collection of str
+        Names of all channels.
+
+    Examples
+    --------
+    >>> [is_taken(name, ["oil_degc"]) for name in ("state", "t_s", "oil_degc_quality", "air_quality", "heat_w")]
+    [True, True, True, False, False]
+    """
+    is_ours = name in (*TIMES, MEASURED_HEAT) or (is_computed(name) and name not in ROLES)
+    return is_ours or (name.endswith(QUALITY) and name.removesuffix(QUALITY) in channels)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,8 +136,8 @@ class Table:
         if not {"y_pred_um", "y_offset_um"} <= self.columns.keys():
             return self, self.remarks
         kept = {name: values for name, values in self.columns.items() if not is_computed(name)}
-        if "heat_measured_w" in kept:
-            kept["heat_w"] = kept.pop("heat_measured_w")
+        if MEASURED_HEAT in kept:
+            kept["heat_w"] = kept.pop(MEASURED_HEAT)
         words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."
         return replace(self, columns=kept), (*self.remarks, Remark(DataRemark.ESTIMATES_LEFT_OUT, words))
 
@@ -282,7 +303,7 @@ def _without_bad(
     Yields a remark on each channel that lost values.
     """
     for column, marks in arrays.items():
-        channel = column.removesuffix("_quality")
+        channel = column.removesuffix(QUALITY)
         if channel == "heat_w" and "heat_measured_w" in numbers:
             channel = "heat_measured_w"
         if column == channel or column in numbers or channel not in numbers:

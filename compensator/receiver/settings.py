@@ -238,7 +238,7 @@ def load_tables(path: Path) -> dict[str, Any]:
         data = read_file(path, SETTINGS_MAX_BYTES)
         if any(lexeme["deep"] for lexeme in _LEXEME.finditer(data)):
             raise ReceiverError(f"{path}: a key of more than {KEY_PARTS} parts")
-        return tomllib.loads(data.decode("utf-8"))
+        return tomllib.loads(data.decode("utf-8-sig"))  # editors on Windows begin a file with a mark
     except OSError as error:
         raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or an integer of thousands of digits

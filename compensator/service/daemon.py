@@ -268,6 +268,11 @@ class Daemon:
         """Whether a diagnosis, or what follows from it, is in progress beside the samples: simulated time may wait."""
         return self._loop is not None and self._loop.is_working
 
+    @property
+    def unfinished(self) -> str:
+        """After the end of the run, what of the recording is not on disk; empty if it is complete."""
+        return self._journal.unfinished
+
     def stop(self) -> None:
         """End the run after the current poll; the recording is finished."""
         self._stop = True

@@ -68,6 +68,8 @@ class Journal:
         self._new_file, self._model = False, None  # type: tuple[bool, bytes | None]
         #: Reason with which the last offset was published, and the last error of the disk.
         self._reason, self._error = "", None  # type: tuple[str, BaseException | None]
+        #: Once it is closed, what is not on disk; empty if everything is.
+        self.unfinished = ""
 
     def start_new_file(self, model: bytes | None = None) -> None:
         """Open a new file with the next sample; attach another model if one is given."""
@@ -193,11 +195,15 @@ class Journal:
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
             figures = f"The disk has not accepted the rest of the recording for {CLOSING_S:g} s."
             log.warning("%s", Remark(ServiceWarning.DISK_FINISHING, figures).marked)
-        if self._writer.waiting:
-            log.error("%d sample(s) could not be written to disk", self._writer.waiting)
+        missing = []
+        if lost := self._writer.waiting + self._writer.count_dropped():
+            missing.append(f"{lost} sample(s) could not be written to disk")
+            log.error("%s", missing[-1])
         error = closing.exception()
         if isinstance(error, OSError):
             data = RecordingData(code=RecordingCode.NOT_FINISHED)
-            self._events.note(EventKind.RECORDING, f"the recording could not be finished: {error}", data.table())
-        elif error is not None:
+            missing.append(f"the recording could not be finished: {error}")
+            self._events.note(EventKind.RECORDING, missing[-1], data.table())
+        self.unfinished = "; ".join(missing)
+        if error is not None and not isinstance(error, OSError):
             raise error

@@ -16,6 +16,7 @@ from compensator.axes import column_of
 from compensator.certificates import Certificate, check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
+from compensator.data.table import is_taken
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.input_file import resolved
 from compensator.model.model_file import read_model_bytes
@@ -129,6 +130,11 @@ def load(path: str) -> Setup:
     """
     loaded = load_config(path)
     config = loaded.config
+    # Only here: recordings of such a machine can still be read and audited.
+    channels = [channel.name for channel in config.channel]
+    if taken := [name for name in channels if is_taken(name, channels)]:
+        words = "`export` writes another column of this name, expected a name of its own"
+        raise ConfigError(f"{path}: channel {taken[0]!r}: {words}")
     folder = loaded.resolve(config.recording.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{path}: recording.folder = {config.recording.folder!r}: is a file, expected a folder")

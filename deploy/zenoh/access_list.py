@@ -234,7 +234,7 @@ def main() -> int:
     parser.add_argument("shop", type=Path, metavar="FILE", help="the participants, TOML")
     path = parser.parse_args().shop
     try:
-        shop = tomllib.loads(read(path).decode())
+        shop = tomllib.loads(read(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         sys.exit(f"{path}: {getattr(error, 'strerror', None) or error}")
     sys.stdout.write(HEADER + json.dumps(router(checked(shop, path)), indent=2) + "\n")

@@ -158,6 +158,11 @@ async def test_a_disk_that_fails_and_returns(tmp_path: Path, monkeypatch: pytest
     logged = [r.data for path in recordings(tmp_path / "rec", MACHINE) for r in read_messages(path, ("offset",))]
     assert logged == [data for name, data in bench.published if name == "offset"]
     assert [file.began for file in found.files] == ["start", "failure", "failure"]
+    assert [file.end for file in found.files] == ["recovered", "recovered", "finished"]
+    why = [remark for remark in found.remarks if remark.code == "recovered"]
+    for remark, after in zip(why, found.files[1:], strict=True):
+        assert f"the service went on in {after.file}, whose events say why;" in remark
+    assert "killed" not in " ".join(found.remarks)
     assert not list((tmp_path / "rec").glob("*.part"))
 
 

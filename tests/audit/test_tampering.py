@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from compensator.audit.findings import Finding
-from compensator.audit.series import Audit, audit
+from compensator.audit.series import Audit, audit, summary
+from compensator.audit.verdict import verdict
 from compensator.recording.container import Attachment, Contents
 from compensator.recording.reading import in_order, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
@@ -412,6 +413,23 @@ def test_a_file_of_which_nothing_is_left_is_told_by_the_next_one(folder: Path) -
     path.write_bytes(path.read_bytes()[:20])
     finding = only(look(folder))
     assert (finding.kind, finding.file) == ("truncated", path.name)
+
+
+@pytest.mark.parametrize("left", [0, 5, 20])
+def test_what_the_last_file_held_is_not_said_to_be_proven(folder: Path, left: int) -> None:
+    """A kill as a file begins leaves such a one, so it is no finding; but nothing shows that it never held a record."""
+    path = recordings(folder, MACHINE)[-1]
+    path.write_bytes(path.read_bytes()[:left])  # magic and a part of the header: alike in every file
+    found = look(folder)
+    assert found.clean and [file.file for file in found.perhaps_emptied] == [path.name]
+    assert verdict(found).startswith("Proven in part: ")
+    assert "3 recording(s); 1 of them without a record, which may have been removed" in verdict(found)
+    (remark,) = found.remarks
+    assert remark.code == "torn" and f"{path.name}: ends before the first record ({left} bytes), and no" in remark
+    assert "between the first and the last of them nothing was changed, removed" in summary(found)
+    # The next start continues from the file before, and so shows that this one held nothing then.
+    Service(folder, start_ns=EVENING_NS + 80 * MINUTE_NS, seq=50).run(5).stop()
+    assert not look(folder).perhaps_emptied and "no later file" not in " ".join(look(folder).remarks)
 
 
 def test_a_live_file_cut_anywhere_is_what_a_kill_leaves(folder: Path, tmp_path: Path) -> None:

@@ -12,10 +12,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from compensator.cli import COMMANDS, load, main
+from compensator.config import Zenoh
 from compensator.demo.day import START_NS, run_day
 from compensator.demo.machine import configuration, hardware
 from compensator.model.model_file import load_model
@@ -262,6 +264,7 @@ def test_bad_tables_get_one_line_and_exit_2(
 
 
 PROBE_TABLE = "[probe]\nstd_um = 1.0\nmeasured_max_um = 60.0\nlargest_um = 40.0\n"
+LISTEN = 'listen = ["tcp/127.0.0.1:7447"]'
 BAD_CONFIGS = [
     (
         "offset_max_um = 200.0",
@@ -292,8 +295,44 @@ BAD_CONFIGS = [
     ('mode = "peer"', "mode = 3", "zenoh.mode = 3: expected one of: peer, client, router"),
     ("[machine]", '[loop]\npolicy = "adopt"\nat_utc = "25:00"\n[machine]', "loop.at_utc = '25:00'"),
     ("[machine]", "[loop]\nshadow_h = 1.0\n[machine]", "loop.shadow_h = 1.0"),
+    ('name = "coolant_degc"', 'name = "y_pred_um"', "channel 'y_pred_um': `export` writes another column of this name"),
+    ('name = "coolant_degc"', 'name = "time_utc"', "channel 'time_utc': `export` writes another column of this name"),
+    ('name = "coolant_degc"', 'name = "t_q_degc_quality"', "channel 't_q_degc_quality': `export` writes another"),
+    (LISTEN, LISTEN.replace(":7447", ""), "zenoh.listen[0] = 'tcp/127.0.0.1': expected such as tcp/127.0.0.1:7447 or"),
+    (LISTEN, LISTEN.replace("tcp/", ""), "zenoh.listen[0] = '127.0.0.1:7447': expected such as"),
+    (LISTEN, LISTEN.replace("7447", "99999"), "with a port up to 65535"),
+    (LISTEN, LISTEN.replace("listen", "connect").replace("7447", "65536"), "zenoh.connect[0] = 'tcp/127.0.0.1:65536'"),
+    (LISTEN, LISTEN.replace("tcp", "tpc"), "zenoh.listen[0] = 'tpc/127.0.0.1:7447': expected such as"),
+    (LISTEN, LISTEN.replace("7447", "7447#"), "zenoh.listen[0] = 'tcp/127.0.0.1:7447#': expected such as"),
+    ('name = "vmc-07"', 'name = "vmc-07\\n"', "machine.name = 'vmc-07\\n': has a control character"),
+    ('name = "y_um"', 'name = "y_um\\n"', "].name = 'y_um\\n': has a control character"),
+    ('device = "probe"', 'device = "probe\\n"', "].device = 'probe\\n': has a control character"),
+    ('prefix = "shop/sim"', 'prefix = "shop/sim\\n"', "zenoh.prefix = 'shop/sim\\n': has a control character"),
+    (
+        'folder = "recordings"',
+        'folder = "recordings\\n"',
+        "recording.folder = 'recordings\\n': has a control character",
+    ),
     ("[machine]", PROBE_TABLE + "often = true\n[machine]", "probe.often: no such key, expected one of: std_um"),
 ]
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/router.shop:0",
+        "udp/[::]:65535",
+        "tcp/::1:7447",
+        "ws/localhost:07447",
+        "tcp/10.0.0.1:7447?rel=1#iface=eth0",
+        "quic/a:1",
+        "unixsock-stream//run/z z",
+        "unixsock-stream/run/z",
+    ],
+)
+def test_endpoints_that_zenoh_takes_are_taken(endpoint: str) -> None:
+    """Opened with eclipse-zenoh 1.10.2, but for the certificates that QUIC needs and hosts that are not there."""
+    assert msgspec.convert({"prefix": "p", "listen": [endpoint]}, Zenoh).listen == [endpoint]
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), BAD_CONFIGS)

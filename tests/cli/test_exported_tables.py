@@ -7,9 +7,11 @@ import pytest
 from mcap.writer import Writer
 
 from compensator.cli import main
+from compensator.config import parse_config
 from compensator.data.measurement import read
-from compensator.data.table import EXPORTED
+from compensator.data.table import EXPORTED, is_taken
 from compensator.recording.reading import read_messages
+from tests.audit.made import CONFIG as MADE
 from tests.audit.made import MACHINE, Service, other_model
 
 
@@ -29,6 +31,16 @@ def test_an_exported_recording_holds_the_same_measurements(recording: Path, tmp_
     for name, values in wanted.columns.items():
         np.testing.assert_array_equal(found.columns[name], values)
     assert [one.code for one in read(table).at_period(60.0).remarks] == ["estimates_left_out"]
+
+
+def test_every_column_that_is_no_channel_is_refused_as_the_name_of_one(recording: Path, tmp_path: Path) -> None:
+    table = tmp_path / "day.csv"
+    assert main(["export", str(recording), "--out", str(table)]) == 0
+    columns = set(table.read_text(encoding="utf-8").splitlines()[0].split(","))
+    channels = {channel.name for channel in parse_config(MADE, source="test").channel}
+    assert channels < columns and not [name for name in channels if is_taken(name, channels)]
+    # A channel `heat_w` is the measured heat, which has a column of its own.
+    assert {name for name in columns - channels if not is_taken(name, channels)} == {"heat_w"}
 
 
 def test_a_heat_that_was_measured_is_the_known_heat(tmp_path: Path) -> None:
@@ -55,6 +67,7 @@ def test_several_recordings_are_one_table_in_the_order_of_their_samples(
     for words, expected in (
         ([first, first], "no samples in it that the files before it have not"),
         ([first, other_machine(second, tmp_path / "other.mcap")], "expected recordings of one machine"),
+        ([second, tmp_path / "other.mcap"], "expected recordings of one machine"),  # with the same numbers
     ):
         assert main(["export", *map(str, words), "--out", str(tmp_path / "none.csv")]) == 2
         assert expected in capsys.readouterr().err and not (tmp_path / "none.csv").exists()

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import pytest
@@ -25,6 +26,9 @@ from tests.audit.made import CONFIG
 TABLE = "t_s,t_q_degc,at_degc,y_um,heat_w\n" + "".join(f"{60 * i},20.{i % 7},20.0,0.{i},30\n" for i in range(300))
 #: No refusal takes longer, s, on a busy computer either.
 PATIENCE_S = 60.0
+
+
+Kind = TypeVar("Kind")
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
@@ -81,6 +85,14 @@ def test_toml_that_takes_long(text: bytes, words: str) -> None:
     for parse, kind in ((parse_config, ConfigError), (parse_model, ModelError)):
         with pytest.raises(kind, match=r"x\.toml"):
             parse(text, source="x.toml")
+
+
+def test_toml_may_begin_with_the_mark_of_an_editor() -> None:
+    mark = "\ufeff".encode()
+    assert parse_config(mark + CONFIG, source="x.toml") == parse_config(CONFIG, source="x.toml")
+    assert parse_toml(mark + b"a = 1") == {"a": 1}
+    with pytest.raises(ConfigError, match="Invalid statement"):
+        parse_config(CONFIG + mark, source="x.toml")
 
 
 @pytest.mark.parametrize("nested", ["[", '{"a":'])
@@ -192,22 +204,29 @@ def test_limits_are_finite_and_possible(before: str, after: str) -> None:
         assert before.partition(" ")[0] in str(refusal.value)
 
 
-def numbers_in(kind: object, where: str) -> Iterator[tuple[str, msgspec.inspect.FloatType]]:
-    """Every number of a table and of those in it; bounds of a range are checked apart."""
+def values_in(kind: object, of: type[Kind], where: str) -> Iterator[tuple[str, Kind]]:
+    """Every value of a type in a table and in those in it; bounds of a range are checked apart."""
     for part in getattr(kind, "fields", ()):
-        yield from numbers_in(part.type, f"{where}.{part.encode_name}")
+        yield from values_in(part.type, of, f"{where}.{part.encode_name}")
     for inner in (*getattr(kind, "types", ()), *filter(None, [getattr(kind, "item_type", None)])):
-        yield from numbers_in(inner, where)
-    if isinstance(kind, msgspec.inspect.FloatType):
+        yield from values_in(inner, of, where)
+    if isinstance(kind, of):
         yield where, kind
 
 
 def test_every_number_of_a_configuration_has_a_smallest_and_a_largest_value() -> None:
-    found = list(numbers_in(msgspec.inspect.type_info(Config), "config"))
+    found = list(values_in(msgspec.inspect.type_info(Config), msgspec.inspect.FloatType, "config"))
     assert len(found) > 40
     for where, kind in found:
         assert kind.gt is None and kind.ge is not None and kind.le is not None, where
         assert kind.ge <= 0.0 or kind.ge >= 1e-9, where
+
+
+def test_no_pattern_of_a_configuration_matches_before_a_line_end() -> None:
+    found = values_in(msgspec.inspect.type_info(Config), msgspec.inspect.StrType, "config")
+    patterns = {where: kind.pattern for where, kind in found if kind.pattern is not None}
+    assert len(patterns) >= 5
+    assert not {where: pattern for where, pattern in patterns.items() if not pattern.endswith(r"\Z")}
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,25 @@ def test_a_signal_that_waited_for_the_program_to_start_ends_it(
     assert done.returncode in (0, 130, -signal.SIGTERM) and "Traceback" not in done.stderr, done.stderr
 
 
+def test_a_recording_that_is_not_complete_is_no_success(tmp_path: Path) -> None:
+    port = free_port()
+    text = MACHINE.replace("{port}", str(port)).replace("poll_interval_s = 1.0", "poll_interval_s = 0.1")
+    (tmp_path / "machine.toml").write_text(text)
+    full = "import os, resource as of, sys\nof.setrlimit(of.RLIMIT_FSIZE, (0, 0))\nos.execv(sys.argv[1], sys.argv[1:])"
+    command = [sys.executable, "-c", full, sys.executable, *COMMAND, "run", "--config", "machine.toml"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            while "running" not in process.stderr.readline():
+                assert process.poll() is None
+            process.terminate()
+            *_, last = process.communicate(timeout=50)[1].splitlines()
+        finally:
+            process.kill()
+    assert process.returncode == 1
+    assert last.startswith("compensator: stopped; the recording is not complete: the recording could not be finished: ")
+
+
 def test_sigterm_ends_the_example_that_was_started_with_it_ignored() -> None:
     port = free_port()
     ignored = IGNORING.replace("signal.pthread_sigmask", "# signal.pthread_sigmask")

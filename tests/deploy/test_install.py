@@ -254,6 +254,11 @@ def test_a_recording_that_the_service_could_not_write_is_refused(pc: Pc, folder:
     assert pc.system.units == []
 
 
+def test_a_configuration_may_begin_with_a_byte_order_mark(pc: Pc) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    assert pc.machine("\ufeff").read_bytes().startswith(b"\xef\xbb\xbf")
+
+
 def test_removal_keeps_configuration_and_recordings_unless_told(pc: Pc) -> None:
     pc.activate(pc.version("1.0-aaaa"), journal_limits=True)
     config = pc.machine("")

@@ -105,6 +105,14 @@ def test_bad_settings_get_one_line(tmp_path: Path, old: str, new: str, expected:
     assert expected in text and str(path) in text and "\n" not in text
 
 
+def test_settings_may_begin_with_the_mark_of_an_editor(tmp_path: Path) -> None:
+    path = tmp_path / "receiver.toml"
+    path.write_text(GOOD)
+    settings = load_settings(path)
+    path.write_text(GOOD, encoding="utf-8-sig")
+    assert load_settings(path) == settings
+
+
 def test_keys_that_take_long_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "receiver.toml"
     for text, expected in (("a" + ".a" * 100_000, "more than 32 parts"), ('"' + '\\"' * 400_000, "not a TOML file")):

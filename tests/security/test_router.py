@@ -124,6 +124,11 @@ def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
     assert shipped == script("access_list.py", str(DEPLOY / "shop.toml"))
 
 
+def test_a_list_may_begin_with_the_mark_of_an_editor(tmp_path: Path) -> None:
+    (tmp_path / "shop.toml").write_bytes(b"\xef\xbb\xbf" + (DEPLOY / "shop.toml").read_bytes())
+    assert script("access_list.py", str(tmp_path / "shop.toml")) == script("access_list.py", str(DEPLOY / "shop.toml"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [

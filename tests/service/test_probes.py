@@ -185,6 +185,9 @@ def test_the_probe_of_the_contract_is_read() -> None:
     assert read_probe(text).measured_um == 3.2
     assert read_probe(json.dumps(USUAL).encode()).std_um is None
     assert read_probe(json.dumps(USUAL | {"feature": "Bohrung Ø12, 左"}).encode()).feature == "Bohrung Ø12, 左"
+    # All without a name are one feature; only the bridge, which cannot know whether they are, refuses such a line.
+    unnamed = [{key: value for key, value in USUAL.items() if key != "feature"}, USUAL | {"feature": ""}]
+    assert [read_probe(json.dumps(one).encode()).feature for one in unnamed] == ["", ""]
 
 
 async def test_payloads_that_are_none_are_recorded_and_change_nothing(tmp_path: Path) -> None:

@@ -202,6 +202,18 @@ async def test_what_waits_is_bounded_and_what_is_given_up_is_said(
     assert [(e.seq, e.text) for e in kept if e.kind == "command"] == [(12, "zero")]
 
 
+async def test_what_is_lost_at_the_end_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(disk_writer, "WAITING_SAMPLES", 8)
+    bench = replayable(tmp_path)
+    disk = Disk(bench, monkeypatch)
+    at(bench, {10: lambda: disk.go_on(OSError(28, "No space left on device"))})
+    await bench.run(30)
+    assert [o.seq for o in logged(tmp_path / "rec")] == [*range(10)]
+    # Those that wait, and those that were given up before: none of the twenty is on disk.
+    lost = "20 sample(s) could not be written to disk"
+    assert bench.daemon.unfinished == f"{lost}; the recording could not be finished: [Errno 28] No space left on device"
+
+
 async def test_an_error_of_its_own_while_writing_is_said_and_heals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
