@@ -465,6 +465,7 @@ def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diag
             "base_model_sha256": base.sha256,
             "data": [origin.provenance() for one in measured for origin in one.origins],
             "verdict": found.verdict,
+            "held_out": found.held_out,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},
             **({"since_h": found.since_h} if found.since_h else {}),
         }

@@ -21,7 +21,7 @@ from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import CONTRADICTS, deployment_of, is_adequate
+from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, in_free_run
@@ -32,7 +32,7 @@ from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Diagnosis, Remainder, Verdict, warnings_of
+from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
@@ -171,6 +171,7 @@ def _diagnosed(
         advice = advice_of(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
         )
+    refused = _refused(chosen)
     left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
@@ -186,7 +187,7 @@ def _diagnosed(
     return Diagnosis(
         verdict="unexplained" if hides or chosen.reverses_path else verdict,
         effects=effects,
-        held_out=how_held_out(evidence),
+        held_out=how_held_out(evidence, () if refused else _of_no_model(effects)),
         model=extended,
         evidence=evidence,
         residual_before=np.where(evidence.used, evidence.without_nuisances(before), np.nan),
@@ -196,7 +197,7 @@ def _diagnosed(
         named_rms_um=rms_of(evidence.left(found.named)[evidence.used]),
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
-        held_out_after=held_out.whole,
+        held_out_after=held_out.nothing if refused else held_out.whole,
         tried=_ranked(found, effects),
         warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off), *warnings),
         steps=held_out.steps,
@@ -204,7 +205,19 @@ def _diagnosed(
         ceiling=ceiling,
         advice=advice,
         could_hide=could_hide,
+        refused=refused,
     )
+
+
+def _refused(chosen: Deployment) -> Refused | None:
+    """Return what a model could have of what was found, where none of it is deployed."""
+    has_any = chosen.found.remainder is not None or any(effect.is_refused for effect in chosen.effects)
+    return Refused(why=chosen.refused, held_out=chosen.held_out.whole) if chosen.is_refused and has_any else None
+
+
+def _of_no_model(effects: Sequence[FoundEffect]) -> list[str]:
+    """Return the kinds of effects that no model can have, and in whose place no remainder stands."""
+    return sorted({effect.kind for effect in effects if not effect.effect.deployable and not effect.replaced})
 
 
 def _as_begun(found: Findings) -> Findings:

@@ -128,7 +128,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     effects = "effect" if one else "all effects"
     if refitted:
         effects += ", with the paths refitted"
-    inside = [diagnosis.deploys(effect) for effect in diagnosis.effects]
+    inside = [effect.deployable for effect in diagnosis.effects]
     if not all(inside):
         effects += " (not in the extended model)" if not any(inside) else " (not all in the extended model)"
     lines = [
@@ -160,7 +160,8 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         parts = ["the remainder, in place of the effects"] if remainder.instead else [*parts, "the remainder"]
     lines = [time.line("before" if parts else "base model", diagnosis.held_out_before)]
     if parts:
-        lines.append(time.line(f"after: {' and '.join(parts)}", diagnosis.held_out_after))
+        with_it = "with what is not deployed" if diagnosis.refused else "after"
+        lines.append(time.line(f"{with_it}: {' and '.join(parts)}", diagnosis.held_out_found))
     return Figure(
         title=f"Residual{' before and after the extension' if parts else ''} on held-out data",
         x_label=time.label,
@@ -173,7 +174,7 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
 
 
 def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [explanation(diagnosis, effect)]
+    blocks: list[Block] = [explanation(effect)]
     if len(diagnosis.effects) > 1:
         # The only effect is in the first picture.
         blocks.append(_effect_figure(time, diagnosis, effect))
@@ -201,7 +202,7 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
                 "residual without it", diagnosis.residual_after + diagnosis.remainder_um + effect.removed, weight=0.9
             ),
             time.line(
-                "effect" if diagnosis.deploys(effect) else "effect (not in the extended model)",
+                "effect" if effect.deployable else "effect (not in the extended model)",
                 effect.signal,
                 weight=2.2,
             ),

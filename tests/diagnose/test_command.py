@@ -57,7 +57,8 @@ def test_json_model_and_page(first, base):
         assert effect["rms_after_um"] < effect["rms_before_um"]
         for value in effect["parameters"].values():
             assert 0.0 < value["std"] < abs(value["value"])
-    assert found["after"]["rms_um"] < found["before"]["rms_um"]
+    assert found["after"]["rms_um"] < found["before"]["rms_um"] and "refused" not in found
+    assert found["held_out"].endswith("; after: also with drift, which no model can have")
     assert all({"kind", "channel", "rms_after_um", "how_to_tell_apart"} <= set(rival) for rival in found["rivals"])
     model = load_model(out / "model.toml")
     assert [effect.kind for effect in model.effects] == ["scheduled"]
@@ -106,6 +107,11 @@ def test_a_reversed_y_is_no_effect_of_the_machine(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "unexplained" and "path_reversed" in found["warning_codes"]
     assert load_model(out / "model.toml").effects == ()
+    # What model.toml has not is not deployable, and the errors after are those of model.toml.
+    assert found["effects"] and not any(effect["deployable"] for effect in found["effects"])
+    assert all("Not deployed: a path would act the other way round." in one["explanation"] for one in found["effects"])
+    assert found["after"] == found["before"] and found["refused"]["rms_um"] < 0.7 * found["before"]["rms_um"]
+    assert found["refused"]["why"] == "a path would act the other way round"
 
 
 def test_data_without_y_is_refused(tmp_path, capsys):
