@@ -519,6 +519,11 @@ class ModelWarning(Code):
         "The base model misses much of its own calibration, and its paths were kept as they are.",
         "Calibrate it anew, or record for longer (--keep-paths keeps them in any case).",
     )
+    DEVIATION_CONTRADICTED = (
+        "deviation_contradicted",
+        "The data contradict the standard deviation that the model states of its own error.",
+        "Find out what differs from the calibration; a new calibration states the deviation of its own data.",
+    )
 
 
 class DataRemark(Code):

@@ -116,7 +116,7 @@ class DiagnosisResult(_DiagnosisFiles):
     Parameters
     ----------
     model : ThermalModel
-        The base model with every deployable effect, as read back from its file.
+        The base model with every deployable effect, as read back from its file; the base where nothing was added.
     diagnosis : Diagnosis
         Effects with their signals, residuals, errors before and after.
     remarks : tuple of Remark
@@ -127,6 +127,8 @@ class DiagnosisResult(_DiagnosisFiles):
         Names of columns and texts of the axis.
     since_utc_s : float, optional
         When the first of the data begin, s since 1970 UTC, where it is known.
+    sources : tuple of mapping
+        Name and hash of the data, as a model file states them.
     """
 
     model: ThermalModel
@@ -135,6 +137,7 @@ class DiagnosisResult(_DiagnosisFiles):
     free_run: tuple[FreeRunErrors, ...] = ()
     words: AxisWords = field(default_factory=AxisWords)
     since_utc_s: float | None = None
+    sources: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -173,7 +176,14 @@ class DiagnosisResult(_DiagnosisFiles):
         """Return the content of the page."""
         from compensator.report.diagnosis import page_of
 
-        page = page_of(self.diagnosis, self.model, self.remarks, self.free_run, since_utc_s=self.since_utc_s)
+        page = page_of(
+            self.diagnosis,
+            self.model,
+            self.remarks,
+            self.free_run,
+            since_utc_s=self.since_utc_s,
+            sources=self.sources,
+        )
         return self.words(page)
 
     def plot(self) -> Plot:
@@ -426,8 +436,10 @@ def _diagnosed(
         executor_map=executor_map,
     )
     remarks += found.evidence.no_causes.values()
-    extended = as_in_file(found.model, _provenance(base, measured, found))
-    models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
+    is_extended = found.model is not base
+    sources = [origin.provenance() for one in measured for origin in one.origins]
+    extended = as_in_file(found.model, _provenance(base, sources, found) if is_extended else {})
+    models = {BASE: base, EXTENDED: extended} if is_extended else {BASE: base}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
     free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]
     if fit_until_h is not None:
@@ -446,6 +458,7 @@ def _diagnosed(
         free_run=shown,
         words=words,
         since_utc_s=measured[0].since_utc_s,
+        sources=tuple(sources),
     )
 
 
@@ -457,13 +470,13 @@ def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
     return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 
-def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diagnosis) -> dict[str, Any]:
+def _provenance(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis) -> dict[str, Any]:
     """Return the provenance of an extended model."""
     return {
         "diagnosis": {
             "source": f"compensator {__version__} diagnose",
             "base_model_sha256": base.sha256,
-            "data": [origin.provenance() for one in measured for origin in one.origins],
+            "data": sources,
             "verdict": found.verdict,
             "held_out": found.held_out,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},

@@ -16,7 +16,7 @@ from compensator.data.axes import AxisLike, asked_axes
 from compensator.display import Shown
 from compensator.errors import ModelError, UsageError
 from compensator.model.model_file import load_axes, load_model, parse_axes
-from compensator.model.model_writer import dump_axes
+from compensator.model.model_writer import bytes_of
 from compensator.model.simulation import csv_rows
 from compensator.model.thermal_model import ThermalModel
 
@@ -93,7 +93,7 @@ def axes_as_in_file(models: Mapping[str, ThermalModel]) -> dict[str, ThermalMode
     ModelError
         If they cannot be stored in a file.
     """
-    return parse_axes(dump_axes(models).encode("utf-8"), source=next(iter(models.values())).name)
+    return parse_axes(bytes_of(models), source=next(iter(models.values())).name)
 
 
 def write_curves(path: str | os.PathLike[str], columns: dict[str, Vector]) -> Path:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -153,7 +153,11 @@ def _diagnosed(
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model
-    extended = _with_deviation(extended, model, found, effects, held_out)
+    deviation_um = _deviation_um(extended, model, found, effects, held_out)
+    if deployed:
+        extended = dataclasses.replace(extended, y_std_um=deviation_um, sha256="")
+    else:
+        remarks = tuple(_deviation_contradicted(model.y_std_um, deviation_um))
     ceiling = _ceiling(held_out)
     verdict, is_explained = _verdict(
         found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None, is_off=is_off
@@ -382,13 +386,20 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     ]
 
 
-def _with_deviation(
-    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
-) -> ThermalModel:
-    """Return a model with the standard deviation of its own error that the data show.
+def _deviation_contradicted(stated_um: float, shown_um: float) -> Iterator[Remark]:
+    """Yield a remark where the data contradict the deviation that a model states to which nothing is added."""
+    if shown_um > VERDICT_TIMES * stated_um or stated_um > VERDICT_TIMES * shown_um:
+        text = (
+            f"The model states {stated_um:.2f} µm as the standard deviation of its own error; these data show "
+            f"{shown_um:.2f} µm. It was left as it is."
+        )
+        yield Remark(ModelWarning.DEVIATION_CONTRADICTED, text)
 
-    Where nothing is deployed, what the model stated is replaced only if the data contradict it.
-    """
+
+def _deviation_um(
+    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
+) -> float:
+    """Return the standard deviation of a model's own error that the data show, µm."""
     evidence, deploys = found.search.evidence, extended is not model
     # What depends on time alone is an error of the measurement: it is not in the machine that the model runs on.
     of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
@@ -409,10 +420,7 @@ def _with_deviation(
         left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.
     late = late_variance_um2(extended) - late_variance_um2(model)
-    left = max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)
-    if not deploys and left <= VERDICT_TIMES**2 * model.y_std_um**2 and model.y_std_um**2 <= VERDICT_TIMES**2 * left:
-        return model
-    return dataclasses.replace(extended, y_std_um=float(np.sqrt(left)), sha256="")
+    return float(np.sqrt(max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)))
 
 
 def _refitted(old: ThermalModel, new: ThermalModel) -> str:

@@ -75,6 +75,7 @@ def page_of(
     free_run: Sequence[FreeRunErrors] = (),
     *,
     since_utc_s: float | None = None,
+    sources: Sequence[Mapping[str, Any]] = (),
 ) -> Page:
     """Make the page.
 
@@ -90,6 +91,8 @@ def page_of(
         Errors of both models in free run as the service runs.
     since_utc_s : float, optional
         When the data begin, s since 1970 UTC.
+    sources : sequence of mapping
+        Name and hash of the data.
     """
     time = TimeAxis.of(diagnosis, since_utc_s)
     found = figures(diagnosis, free_run)
@@ -107,9 +110,8 @@ def page_of(
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
-    blocks.append(_details(time, diagnosis, model, remarks))
+    blocks.append(_details(time, diagnosis, model, remarks, sources))
     title = f"Diagnosis: what {model.name} lacks"
-    sources = model.provenance.get("diagnosis", {}).get("data", [])
     return Page(title=title, verdict=headline(found), blocks=blocks, tone=tone_of(found), data=files_of(sources))
 
 
@@ -253,15 +255,18 @@ def _ranking(diagnosis: Diagnosis) -> Details:
     )
 
 
-def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
+def _details(
+    time: TimeAxis,
+    diagnosis: Diagnosis,
+    model: ThermalModel,
+    remarks: Sequence[str],
+    sources: Sequence[Mapping[str, Any]],
+) -> Details:
     rows = [
         ["extended model, SHA-256", model.sha256],
         ["standard deviation that it states, µm", f"{model.y_std_um:.2f}"],
     ]
-    rows += [
-        [f"data: {d.get('file') or d['table']}", d["sha256"]]
-        for d in model.provenance.get("diagnosis", {}).get("data", [])
-    ]
+    rows += [[f"data: {one.get('file') or one['table']}", one["sha256"]] for one in sources]
     figure = Figure(
         title="Residual of the fit to all data",
         x_label=time.label,
