@@ -576,7 +576,7 @@ class DataRemark(Code):
     )
     TEMPERATURE_MISSING = (
         "temperature_missing",
-        "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
+        "T_Q or AT is missing for too long to interpolate; the record is split there, as where rows are missing.",
         "Check the sensor and the logger.",
     )
     TEMPERATURE_SPARSE = (
