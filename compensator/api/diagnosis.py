@@ -42,13 +42,14 @@ from compensator.diagnose.series import series_of
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
-from compensator.errors import UsageError
+from compensator.errors import UsageError, of_files
 from compensator.identify.pairs import pairs
 from compensator.model.effects.hypothesis import Place, place_in_words
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_axes, write_model
 from compensator.model.simulation import require_channels
 from compensator.model.thermal_model import ThermalModel
+from compensator.options import check_types
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ class _DiagnosisFiles(Paged):
         """Write all curves as CSV."""
         raise NotImplementedError
 
+    @of_files()
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
 
@@ -87,8 +89,8 @@ class _DiagnosisFiles(Paged):
 
         Raises
         ------
-        UsageError
-            If the parent folder does not exist.
+        CompensatorError
+            If the parent folder does not exist, or a file cannot be written.
         """
         target = Path(path)
         if target.suffix.lower() == ".toml":
@@ -98,6 +100,7 @@ class _DiagnosisFiles(Paged):
             self.save_all(target, series=True)
         return target
 
+    @of_files()
     def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
         """Write model, `diagnosis.json`, page and, if wanted, curves into a folder; the page also to another file."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -343,6 +346,7 @@ def diagnose(
     CompensatorError
         If model or data cannot be read, or there is too little data.
     """
+    check_types(fit_until_h=fit_until_h)
     bases = models_of(model, axis)
     given = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)

@@ -15,6 +15,7 @@ from compensator.api.identification_result import IdentificationResult
 from compensator.axes import label_of
 from compensator.codes import Remark
 from compensator.display import Listing, Table, Words, listed, warnings_of, with_std
+from compensator.errors import of_files
 from compensator.identify.pairs import Pair
 from compensator.identify.summary import MODEL, estimates
 from compensator.model.free_run import NOTHING
@@ -135,15 +136,14 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
             "with time constants of its own. Free run: as the service runs, the worst of all data.",
         )
 
+    @of_files()
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the model file of all axes.
 
         Raises
         ------
-        UsageError
-            If the folder does not exist.
-        OSError
-            If the file cannot be written.
+        CompensatorError
+            If the folder does not exist, or the file cannot be written.
         """
         write_axes(Path(path), self.model)
         return Path(path)

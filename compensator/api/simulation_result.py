@@ -98,7 +98,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
 
         Raises
         ------
-        OSError
+        CompensatorError
             If the file cannot be written.
         """
         return write_curves(path, self.table)
@@ -144,7 +144,7 @@ class SimulatedAxes(AxisResults[SimulationResult]):
 
         Raises
         ------
-        OSError
+        CompensatorError
             If the file cannot be written.
         """
         return write_curves(path, self.table)
