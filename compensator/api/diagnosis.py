@@ -19,7 +19,7 @@ from compensator.api.axis_results import AxisModels
 from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of, write_curves
 from compensator.arrays import Vector
 from compensator.atomic_write import require_folder
-from compensator.axes import AxisWords, column_of, label_of
+from compensator.axes import FIRST, AxisWords, column_of, label_of
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
@@ -223,6 +223,11 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
         """The verdict of the axis that lacks most."""
         order = ("adequate", "explained", "partly_explained", "unexplained")
         return max((result.verdict for result in self.results.values()), key=order.index)
+
+    @property
+    def effects(self) -> tuple[FoundEffect, ...]:
+        """The effects that the models lack, with their `axis`; axis by axis as in `diagnosis.json`."""
+        return tuple(effect for result in self.results.values() for effect in result.effects)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis."""
@@ -439,6 +444,9 @@ def _diagnosed(
         progress=progress,
         executor_map=executor_map,
     )
+    if words.axis != FIRST:
+        effects = tuple(dataclasses.replace(effect, axis=words.axis) for effect in found.effects)
+        found = dataclasses.replace(found, effects=effects)
     remarks += found.evidence.no_causes.values()
     is_extended = found.model is not base
     sources = [origin.provenance() for one in measured for origin in one.origins]

@@ -47,6 +47,19 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
     alone_rms_um: Mapping[str, float] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
 
+    @property
+    def params(self) -> dict[str, dict[str, float]]:
+        """Gains at rest and time constants of each axis, as `model` by axis: `found.params["z"]["dtf_gain_um_per_w"]`.
+
+        The names are those of one axis alone.
+        """
+        return {axis: result.params for axis, result in self.results.items()}
+
+    @property
+    def std_errors(self) -> dict[str, dict[str, float]]:
+        """Standard errors of `params`, by the same names."""
+        return {axis: result.std_errors for axis, result in self.results.items()}
+
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
         return {

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.axes import FIRST
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
@@ -57,6 +58,8 @@ class FoundEffect:
         Whether the remainder is deployed in its place, since it explains the data better.
     left_in : bool
         Whether it is a late T_Q whose correction is not deployed, since the model is better without it.
+    axis : str
+        The axis that it moves.
     refused : str
         Why nothing of what was found is deployed, in words; empty where something is.
     """
@@ -70,6 +73,7 @@ class FoundEffect:
     replaced: bool = False
     left_in: bool = False
     refused: str = ""
+    axis: str = FIRST
 
     def __getitem__(self, key: str) -> Any:
         return getattr(self, key)

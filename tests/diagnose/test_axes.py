@@ -5,6 +5,7 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import compensator as tc
@@ -70,6 +71,22 @@ def test_each_axis_gets_its_own_effect_in_one_file(found, files, tmp_path):
     before, after = tc.simulate(base, table), tc.simulate(loaded, table)
     for axis in ("y", "z"):
         assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
+
+
+def test_what_is_asked_of_one_axis_is_answered_by_several(found, files):
+    named = [(effect["axis"], effect["kind"], effect.channel) for effect in found.effects]
+    listed = [(one["axis"], one["kind"], one["channel"]) for one in found.to_dict()["effects"]]
+    assert named == listed == [("y", "input", "coolant_degc"), ("z", "input", "coolant_degc")]
+    base, table = files
+    out = tc.simulate(base, table)
+    assert out["y_pred_um"] is out["y"]["y_pred_um"] and out["z_pred_um"].size == out["t_s"].size
+    assert list(out) == ["x", "y", "z"] and set(out.scores) == set(out)
+    with pytest.raises(KeyError):
+        out["b_pred_urad"]
+    frame = tc.simulate(base, pd.read_csv(table))
+    assert isinstance(frame, pd.DataFrame) and list(frame) == list(out.table)
+    np.testing.assert_array_equal(frame["z_pred_um"], out["z_pred_um"])
+    assert frame.result["z"].scores == out["z"].scores == frame.scores["z"]
 
 
 def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch):
