@@ -58,6 +58,8 @@ if TYPE_CHECKING:
 
 #: Files that `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html", "series.csv")
+#: Figures of one axis that `diagnosis.json` of several axes has at the top, too.
+_TOP = ("before", "after", "held_out", "noise_floor_um", "remainder", "ceiling")
 
 
 class _DiagnosisFiles(Paged):
@@ -230,7 +232,11 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
         return tuple(effect for result in self.results.values() for effect in result.effects)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis."""
+        """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis.
+
+        What a reader of one axis looks for at the top (`_TOP`) is there that of Y, or without it of the first axis,
+        which `figures_of` names.
+        """
         axes = {axis: result.to_dict() for axis, result in self.results.items()}
         listed = {
             key: [{"axis": axis, **one} for axis, found in axes.items() for one in found[key]]
@@ -247,7 +253,9 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
             }
             for one in self.machine
         ]
-        return {"verdict": self.verdict, **listed, "machine": machine, "axes": axes}
+        first = FIRST if FIRST in axes else next(iter(axes))
+        top = {"figures_of": first, **{key: axes[first][key] for key in _TOP}}
+        return {"verdict": self.verdict, **listed, **top, "machine": machine, "axes": axes}
 
     def sentences(self) -> list[str]:
         """Return what is said of the machine: each effect with its axes, and the verdict of each axis."""

@@ -76,6 +76,9 @@ def test_each_axis_gets_its_own_effect_in_one_file(found, files, tmp_path):
 def test_what_is_asked_of_one_axis_is_answered_by_several(found, files):
     named = [(effect["axis"], effect["kind"], effect.channel) for effect in found.effects]
     listed = [(one["axis"], one["kind"], one["channel"]) for one in found.to_dict()["effects"]]
+    top, own = found.to_dict(), found["y"].to_dict()
+    keys = ("before", "after", "held_out", "noise_floor_um", "remainder", "ceiling")
+    assert top["figures_of"] == "y" and all(top[key] == own[key] for key in keys)
     assert named == listed == [("y", "input", "coolant_degc"), ("z", "input", "coolant_degc")]
     base, table = files
     out = tc.simulate(base, table)
