@@ -404,13 +404,15 @@ def diagnose(
             )
 
     results = {one: diagnosed(one, i, len(axes), counted) for i, one in enumerate(axes)}
-    if len(results) == 1:
-        return next(iter(results.values()))
-    missing = missing_places({one: result.diagnosis for one, result in results.items()})
-    again = after(progress, total)
-    results |= {one: diagnosed(one, i, len(missing), again, places) for i, (one, places) in enumerate(missing.items())}
+    if len(results) > 1:
+        missing = missing_places({one: result.diagnosis for one, result in results.items()})
+        again = after(progress, total)
+        for i, (one, places) in enumerate(missing.items()):
+            results[one] = diagnosed(one, i, len(missing), again, places)
     models = axes_as_in_file({one: result.model for one, result in results.items()})
     results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
+    if len(results) == 1:
+        return next(iter(results.values()))
     names = [one for one in axes if all(column_of(one) in each.table.columns for each in given)]
     records = [record for each in given for record in each.at_period(bases[axes[0]].period_s).records]
     values = {one: [record.columns[column_of(one)] for record in records] for one in names}
@@ -458,7 +460,7 @@ def _diagnosed(
     remarks += found.evidence.no_causes.values()
     is_extended = found.model is not base
     sources = [origin.provenance() for one in measured for origin in one.origins]
-    extended = as_in_file(found.model, _provenance(base, sources, found) if is_extended else {})
+    extended = as_in_file(found.model, _provenance(base, sources, found)) if is_extended else base
     models = {BASE: base, EXTENDED: extended} if is_extended else {BASE: base}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
     free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]

@@ -113,11 +113,16 @@ def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch
     assert told == [(0, 12), (4, 12), (4, 12), (8, 12), (8, 12), (12, 12), (12, 16), (16, 16)]
 
 
-def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
-    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}, hours=12.0))
+def test_a_jump_of_one_axis_is_first_suspected_in_its_probe(tmp_path):
+    base, written = tmp_path / "base.toml", tmp_path / "model.toml"
+    write_axes(base, models())
+    base.write_bytes(b"# of the old machine\n" + base.read_bytes())
+    found = tc.diagnose(base, machine(2, {}, step_um={"z": 8.0}, hours=12.0))
     [effect] = found.machine
     assert effect.place[0] == "step" and effect.suspect == "z"
     assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
+    # Nothing is added to any axis: the file stays.
+    assert found.save(written).read_bytes() == base.read_bytes() and found.sha256 == load_axes(base)["y"].sha256
 
 
 def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():
