@@ -250,6 +250,6 @@ def test_paths_fitted_anew_beside_nothing_are_not_deployed() -> None:
     assert "paths_kept" in why.to_dict()["warning_codes"] and "fitted_anew" not in why.to_dict()["warning_codes"]
     # What the base leaves of this record is said.
     error = np.asarray(machine.record.columns["y_um"]) - tc.simulate(base, machine.record.columns)["y_pred_um"]
-    assert why.model == base
+    assert dataclasses.replace(why.model, sha256=base.sha256) == base
     said = str(next(one for one in why.diagnosis.warnings if one.code == ModelWarning.DEVIATION_CONTRADICTED))
     assert float(said.partition("these data show ")[2].split()[0]) > 0.7 * np.nanstd(error)
