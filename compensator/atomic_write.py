@@ -161,7 +161,11 @@ def _replacement(path: Path, mode: int) -> Iterator[int]:
     """Open a new file in the same folder; at the end it replaces the target, after an error it is removed."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    descriptor = os.open(temporary, flags, mode)
+    try:
+        descriptor = os.open(temporary, flags, mode)
+    except OSError as error:
+        error.filename = str(path)  # nobody knows the other name
+        raise
     try:
         with _naming(path):
             yield descriptor

@@ -27,7 +27,7 @@ from compensator.commands import Answer, arguments
 from compensator.commands.outputs import check_outputs
 from compensator.commands.stopping import stoppable, was_interrupted
 from compensator.commands.wrapping import styled, wrapped
-from compensator.errors import CompensatorError, one_line
+from compensator.errors import CompensatorError, in_words, one_line
 from drivers.errors import DriverError
 
 log = logging.getLogger("compensator")
@@ -166,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:
             raise
-        log.error("compensator: %s", shortened(one_line(_in_words(error))))
+        log.error("compensator: %s", shortened(one_line(in_words(error))))
         result = getattr(error, "result", None)
         code = getattr(error, "exit_code", 1)
         return _printed(json.dumps(result), code) if given.json and result is not None else code
@@ -228,13 +228,6 @@ def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:
     loaded: Callable[[argparse.Namespace], Answer | None]
     loaded = getattr(importlib.import_module(f"compensator.{module}"), function)
     return loaded
-
-
-def _in_words(error: Exception) -> str:
-    """Return an error as one line: "FILE: No such file or directory", not "[Errno 2] …"."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename2 or error.filename}: {error.strerror or error}"
-    return str(error)
 
 
 def shortened(line: str) -> str:

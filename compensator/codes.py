@@ -519,6 +519,11 @@ class ModelWarning(Code):
         "The base model misses much of its own calibration, and its paths were kept as they are.",
         "Calibrate it anew, or record for longer (--keep-paths keeps them in any case).",
     )
+    DEVIATION_CONTRADICTED = (
+        "deviation_contradicted",
+        "The data contradict the standard deviation that the model states of its own error.",
+        "Find out what differs from the calibration; a new calibration states the deviation of its own data.",
+    )
 
 
 class DataRemark(Code):
@@ -571,7 +576,7 @@ class DataRemark(Code):
     )
     TEMPERATURE_MISSING = (
         "temperature_missing",
-        "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
+        "T_Q or AT is missing for too long to interpolate; the record is split there, as where rows are missing.",
         "Check the sensor and the logger.",
     )
     TEMPERATURE_SPARSE = (

@@ -14,7 +14,8 @@ Errors of devices are `drivers.DriverError`; the sampler turns them into qualiti
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -54,6 +55,30 @@ class ServiceError(CompensatorError):
     def __init__(self, text: str, result: Mapping[str, Any] | None = None) -> None:
         super().__init__(text)
         self.result = result
+
+
+def in_words(error: Exception) -> str:
+    """Return an error as one line: "FILE: No such file or directory", not "[Errno 2] …"."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename2 or error.filename}: {error.strerror or error}"
+    return str(error)
+
+
+@contextmanager
+def of_files() -> Iterator[None]:
+    """Turn what the operating system refuses into an error of ours, with the words of the commands; also a decorator.
+
+    Examples
+    --------
+    >>> with of_files():
+    ...     open("/proc/absent")
+    Traceback (most recent call last):
+    compensator.errors.CompensatorError: /proc/absent: No such file or directory
+    """
+    try:
+        yield
+    except OSError as error:
+        raise CompensatorError(in_words(error)) from error
 
 
 def one_line(text: str) -> str:

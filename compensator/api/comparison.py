@@ -26,6 +26,7 @@ from compensator.errors import DataError, ModelError, UsageError
 from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
 from compensator.model.simulation import Scores
 from compensator.model.thermal_model import ThermalModel
+from compensator.options import check_types
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Panel, Plot
@@ -118,7 +119,7 @@ class ComparisonResult(Paged):
 
         Raises
         ------
-        OSError
+        CompensatorError
             If the file cannot be written.
         """
         return write_curves(path, self.columns)
@@ -230,8 +231,11 @@ def compare(
     CompensatorError
         If there is no model or no measured Y, or the models have different sample periods.
     """
+    check_types(from_h=from_h)
     if not isinstance(models, Mapping):
         raise UsageError(f'compare: {type(models).__name__}, expected a dict: {{"first": model, "second": other}}')
+    if not models:
+        raise UsageError("compare: no models, expected one at least")
     found = {str(name): models_of(model, axis) for name, model in models.items()}
     if taken := found.keys() & {NOTHING, PERSISTENCE}:
         raise UsageError(f"compare: {taken.pop()!r} is a row of its own, expected another name for the model")

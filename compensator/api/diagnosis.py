@@ -19,7 +19,7 @@ from compensator.api.axis_results import AxisModels
 from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of, write_curves
 from compensator.arrays import Vector
 from compensator.atomic_write import require_folder
-from compensator.axes import AxisWords, column_of, label_of
+from compensator.axes import FIRST, AxisWords, column_of, label_of
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
 from compensator.data.axes import AxisLike, axes_in, of_axis, words_of
@@ -42,13 +42,14 @@ from compensator.diagnose.series import series_of
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
-from compensator.errors import UsageError
+from compensator.errors import UsageError, of_files
 from compensator.identify.pairs import pairs
 from compensator.model.effects.hypothesis import Place, place_in_words
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_axes, write_model
 from compensator.model.simulation import require_channels
 from compensator.model.thermal_model import ThermalModel
+from compensator.options import check_types
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ if TYPE_CHECKING:
 
 #: Files that `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html", "series.csv")
+#: Figures of one axis that `diagnosis.json` of several axes has at the top, too.
+_TOP = ("before", "after", "held_out", "noise_floor_um", "remainder", "ceiling")
 
 
 class _DiagnosisFiles(Paged):
@@ -76,6 +79,7 @@ class _DiagnosisFiles(Paged):
         """Write all curves as CSV."""
         raise NotImplementedError
 
+    @of_files()
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
 
@@ -87,8 +91,8 @@ class _DiagnosisFiles(Paged):
 
         Raises
         ------
-        UsageError
-            If the parent folder does not exist.
+        CompensatorError
+            If the parent folder does not exist, or a file cannot be written.
         """
         target = Path(path)
         if target.suffix.lower() == ".toml":
@@ -98,6 +102,7 @@ class _DiagnosisFiles(Paged):
             self.save_all(target, series=True)
         return target
 
+    @of_files()
     def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
         """Write model, `diagnosis.json`, page and, if wanted, curves into a folder; the page also to another file."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -116,7 +121,7 @@ class DiagnosisResult(_DiagnosisFiles):
     Parameters
     ----------
     model : ThermalModel
-        The base model with every deployable effect, as read back from its file.
+        The base model with every deployable effect, as read back from its file; the base where nothing was added.
     diagnosis : Diagnosis
         Effects with their signals, residuals, errors before and after.
     remarks : tuple of Remark
@@ -127,6 +132,8 @@ class DiagnosisResult(_DiagnosisFiles):
         Names of columns and texts of the axis.
     since_utc_s : float, optional
         When the first of the data begin, s since 1970 UTC, where it is known.
+    sources : tuple of mapping
+        Name and hash of the data, as a model file states them.
     """
 
     model: ThermalModel
@@ -135,6 +142,7 @@ class DiagnosisResult(_DiagnosisFiles):
     free_run: tuple[FreeRunErrors, ...] = ()
     words: AxisWords = field(default_factory=AxisWords)
     since_utc_s: float | None = None
+    sources: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -173,7 +181,14 @@ class DiagnosisResult(_DiagnosisFiles):
         """Return the content of the page."""
         from compensator.report.diagnosis import page_of
 
-        page = page_of(self.diagnosis, self.model, self.remarks, self.free_run, since_utc_s=self.since_utc_s)
+        page = page_of(
+            self.diagnosis,
+            self.model,
+            self.remarks,
+            self.free_run,
+            since_utc_s=self.since_utc_s,
+            sources=self.sources,
+        )
         return self.words(page)
 
     def plot(self) -> Plot:
@@ -211,8 +226,17 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
         order = ("adequate", "explained", "partly_explained", "unexplained")
         return max((result.verdict for result in self.results.values()), key=order.index)
 
+    @property
+    def effects(self) -> tuple[FoundEffect, ...]:
+        """The effects that the models lack, with their `axis`; axis by axis as in `diagnosis.json`."""
+        return tuple(effect for result in self.results.values() for effect in result.effects)
+
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis."""
+        """Return the content of `diagnosis.json`: effects and rivals with their axis, and all figures of each axis.
+
+        What a reader of one axis looks for at the top (`_TOP`) is there that of Y, or without it of the first axis,
+        which `figures_of` names.
+        """
         axes = {axis: result.to_dict() for axis, result in self.results.items()}
         listed = {
             key: [{"axis": axis, **one} for axis, found in axes.items() for one in found[key]]
@@ -229,7 +253,9 @@ class DiagnosedAxes(AxisModels[DiagnosisResult], _DiagnosisFiles):
             }
             for one in self.machine
         ]
-        return {"verdict": self.verdict, **listed, "machine": machine, "axes": axes}
+        first = FIRST if FIRST in axes else next(iter(axes))
+        top = {"figures_of": first, **{key: axes[first][key] for key in _TOP}}
+        return {"verdict": self.verdict, **listed, **top, "machine": machine, "axes": axes}
 
     def sentences(self) -> list[str]:
         """Return what is said of the machine: each effect with its axes, and the verdict of each axis."""
@@ -333,6 +359,7 @@ def diagnose(
     CompensatorError
         If model or data cannot be read, or there is too little data.
     """
+    check_types(fit_until_h=fit_until_h)
     bases = models_of(model, axis)
     given = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)
@@ -377,13 +404,15 @@ def diagnose(
             )
 
     results = {one: diagnosed(one, i, len(axes), counted) for i, one in enumerate(axes)}
-    if len(results) == 1:
-        return next(iter(results.values()))
-    missing = missing_places({one: result.diagnosis for one, result in results.items()})
-    again = after(progress, total)
-    results |= {one: diagnosed(one, i, len(missing), again, places) for i, (one, places) in enumerate(missing.items())}
+    if len(results) > 1:
+        missing = missing_places({one: result.diagnosis for one, result in results.items()})
+        again = after(progress, total)
+        for i, (one, places) in enumerate(missing.items()):
+            results[one] = diagnosed(one, i, len(missing), again, places)
     models = axes_as_in_file({one: result.model for one, result in results.items()})
     results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
+    if len(results) == 1:
+        return next(iter(results.values()))
     names = [one for one in axes if all(column_of(one) in each.table.columns for each in given)]
     records = [record for each in given for record in each.at_period(bases[axes[0]].period_s).records]
     values = {one: [record.columns[column_of(one)] for record in records] for one in names}
@@ -425,9 +454,14 @@ def _diagnosed(
         progress=progress,
         executor_map=executor_map,
     )
+    if words.axis != FIRST:
+        effects = tuple(dataclasses.replace(effect, axis=words.axis) for effect in found.effects)
+        found = dataclasses.replace(found, effects=effects)
     remarks += found.evidence.no_causes.values()
-    extended = as_in_file(found.model, _provenance(base, measured, found))
-    models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
+    is_extended = found.model is not base
+    sources = [origin.provenance() for one in measured for origin in one.origins]
+    extended = as_in_file(found.model, _provenance(base, sources, found)) if is_extended else base
+    models = {BASE: base, EXTENDED: extended} if is_extended else {BASE: base}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
     free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]
     if fit_until_h is not None:
@@ -446,6 +480,7 @@ def _diagnosed(
         free_run=shown,
         words=words,
         since_utc_s=measured[0].since_utc_s,
+        sources=tuple(sources),
     )
 
 
@@ -457,14 +492,15 @@ def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
     return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 
-def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diagnosis) -> dict[str, Any]:
+def _provenance(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis) -> dict[str, Any]:
     """Return the provenance of an extended model."""
     return {
         "diagnosis": {
             "source": f"compensator {__version__} diagnose",
             "base_model_sha256": base.sha256,
-            "data": [origin.provenance() for one in measured for origin in one.origins],
+            "data": sources,
             "verdict": found.verdict,
+            "held_out": found.held_out,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},
             **({"since_h": found.since_h} if found.since_h else {}),
         }

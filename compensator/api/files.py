@@ -14,9 +14,9 @@ from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
 from compensator.data.axes import AxisLike, asked_axes
 from compensator.display import Shown
-from compensator.errors import ModelError, UsageError
+from compensator.errors import ModelError, UsageError, of_files
 from compensator.model.model_file import load_axes, load_model, parse_axes
-from compensator.model.model_writer import dump_axes
+from compensator.model.model_writer import bytes_of
 from compensator.model.simulation import csv_rows
 from compensator.model.thermal_model import ThermalModel
 
@@ -93,15 +93,16 @@ def axes_as_in_file(models: Mapping[str, ThermalModel]) -> dict[str, ThermalMode
     ModelError
         If they cannot be stored in a file.
     """
-    return parse_axes(dump_axes(models).encode("utf-8"), source=next(iter(models.values())).name)
+    return parse_axes(bytes_of(models), source=next(iter(models.values())).name)
 
 
+@of_files()
 def write_curves(path: str | os.PathLike[str], columns: dict[str, Vector]) -> Path:
     """Write columns that have a `t_s` as CSV; a missing value is an empty cell.
 
     Raises
     ------
-    OSError
+    CompensatorError
         If the file cannot be written.
     """
     with atomic_write(Path(path), may_stream=True) as file:
@@ -124,12 +125,13 @@ class Paged(Shown):
         Raises
         ------
         CompensatorError
-            If the name has another ending, or there is no browser to print with.
+            If the name has another ending, it cannot be written, or there is no browser to print with.
         """
         from compensator.report.formats import checked
 
         return self.write_page(checked(Path(path), option="page"))
 
+    @of_files()
     def write_page(self, path: Path, also: Path | None = None) -> Path:
         """Write the page, and also to another file in the format of its suffix."""
         from compensator.report.formats import write

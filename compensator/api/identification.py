@@ -38,6 +38,7 @@ from compensator.identify.summary import MODEL, figures
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.table import ONE_LINE, is_one_line, shown
 from compensator.model.thermal_model import ThermalModel
+from compensator.options import check_types
 from compensator.progress import Progress, unreported
 
 #: Figures that a model file keeps in its provenance.
@@ -120,6 +121,7 @@ def identify(
     CompensatorError
         If no model can be fitted to the data with these options.
     """
+    check_types(name=name, folds=folds, fit_until_h=fit_until_h, etve_end_h=etve_end_h)
     settings = Settings(
         kind=kind,
         method=method,

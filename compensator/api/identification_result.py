@@ -15,6 +15,7 @@ from compensator.arrays import NAN
 from compensator.axes import AxisWords
 from compensator.data.frames import frame_of
 from compensator.display import Table, Words, is_determined
+from compensator.errors import of_files
 from compensator.identify.calibration import Calibration, joined
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
@@ -99,15 +100,14 @@ class IdentificationResult(Paged):
             found["comparison"] = [dataclasses.asdict(row) for row in self.comparison]
         return found
 
+    @of_files()
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the model file.
 
         Raises
         ------
-        UsageError
-            If the folder does not exist.
-        OSError
-            If the file cannot be written.
+        CompensatorError
+            If the folder does not exist, or the file cannot be written.
         """
         write_model(Path(path), self.model)
         return Path(path)

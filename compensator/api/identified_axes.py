@@ -15,6 +15,7 @@ from compensator.api.identification_result import IdentificationResult
 from compensator.axes import label_of
 from compensator.codes import Remark
 from compensator.display import Listing, Table, Words, listed, warnings_of, with_std
+from compensator.errors import of_files
 from compensator.identify.pairs import Pair
 from compensator.identify.summary import MODEL, estimates
 from compensator.model.free_run import NOTHING
@@ -45,6 +46,19 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
     shared: tuple[tuple[str, ...], ...] = ()
     alone_rms_um: Mapping[str, float] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
+
+    @property
+    def params(self) -> dict[str, dict[str, float]]:
+        """Gains at rest and time constants of each axis, as `model` by axis: `found.params["z"]["dtf_gain_um_per_w"]`.
+
+        The names are those of one axis alone.
+        """
+        return {axis: result.params for axis, result in self.results.items()}
+
+    @property
+    def std_errors(self) -> dict[str, dict[str, float]]:
+        """Standard errors of `params`, by the same names."""
+        return {axis: result.std_errors for axis, result in self.results.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
@@ -135,15 +149,14 @@ class IdentifiedAxes(AxisModels[IdentificationResult]):
             "with time constants of its own. Free run: as the service runs, the worst of all data.",
         )
 
+    @of_files()
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the model file of all axes.
 
         Raises
         ------
-        UsageError
-            If the folder does not exist.
-        OSError
-            If the file cannot be written.
+        CompensatorError
+            If the folder does not exist, or the file cannot be written.
         """
         write_axes(Path(path), self.model)
         return Path(path)

@@ -193,7 +193,7 @@ def summarised(part: Part, whole: Part, model: bytes) -> Diagnosed:
 
 def _needs(found: DiagnosisResult) -> str:
     """Return what a person has to do: effects that cannot be compensated, a poor calibration, a missing sensor."""
-    left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
+    left = [one for one in found.effects if not (one.deployable or one.replaced or one.is_refused)]
     needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
     needs += [one for one in found.diagnosis.warnings if one.code == ModelWarning.PATHS_KEPT]
     advice = found.diagnosis.advice

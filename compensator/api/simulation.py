@@ -67,8 +67,8 @@ def simulate(
     -------
     SimulationResult or SimulationFrame
         One row for each sample of the model. For a DataFrame the result is a DataFrame with the same columns: its
-        `result` is the SimulationResult, `plot()` plots that, and `to_dict` is that of pandas. Of several axes: one
-        SimulationResult for each, in a SimulatedAxes.
+        `result` is the SimulationResult, `plot()` plots that, and `to_dict` is that of pandas. Of several axes the
+        columns of all of them, in a SimulatedAxes, where the name of an axis gives its SimulationResult.
 
     Raises
     ------
@@ -83,9 +83,7 @@ def simulate(
         words = words_of(name, measured, models=[what.name])
         with words.errors():
             results[name] = _simulate(what, with_axis(measured, name), words, correct=correct, y_std_um=y_std_um)
-    if len(results) > 1:
-        return SimulatedAxes(results=results)
-    [result] = results.values()
+    result = SimulatedAxes(results=results) if len(results) > 1 else next(iter(results.values()))
     if not any(one.in_frame for one in measured):
         return result
     from compensator.api.simulation_frame import SimulationFrame

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pandas
 
-from compensator.api.simulation_result import SimulationResult
+from compensator.api.simulation_result import SimulatedAxes, SimulationResult
 from compensator.codes import Remark
 from compensator.data.frames import time_index
 from compensator.model.simulation import Scores
@@ -31,15 +31,16 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
 
     Parameters
     ----------
-    result : SimulationResult
-        The same columns as arrays; its `to_dict()` returns the figures, that of the DataFrame the columns.
+    result : SimulationResult or SimulatedAxes
+        The same columns as arrays, of several axes also by axis; its `to_dict()` returns the figures, that of the
+        DataFrame the columns.
     """
 
     _metadata: ClassVar[list[str]] = ["result"]
-    result: SimulationResult
+    result: SimulationResult | SimulatedAxes
 
     @classmethod
-    def of(cls, result: SimulationResult, start_utc_s: float | None, *, local: bool) -> SimulationFrame:
+    def of(cls, result: SimulationResult | SimulatedAxes, start_utc_s: float | None, *, local: bool) -> SimulationFrame:
         """Make a DataFrame of a result; `start_utc_s`: the time of `t_s` = 0, s since 1970 (`local`: no zone)."""
         frame = cls(result.table, index=time_index(result["t_s"], start_utc_s, local=local))
         frame.result = result
@@ -55,8 +56,8 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
         return FramePlot(self)
 
     @property
-    def scores(self) -> Scores | None:
-        """Fit, rms and peak to peak of the residual, if Y was measured."""
+    def scores(self) -> Scores | dict[str, Scores | None] | None:
+        """Fit, rms and peak to peak of the residual, if Y was measured; of several axes by axis."""
         return self.result.scores
 
     @property

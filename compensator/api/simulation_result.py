@@ -98,7 +98,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
 
         Raises
         ------
-        OSError
+        CompensatorError
             If the file cannot be written.
         """
         return write_curves(path, self.table)
@@ -123,7 +123,18 @@ class SimulationResult(Shown, Mapping[str, Vector]):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class SimulatedAxes(AxisResults[SimulationResult]):
-    """Columns of several axes by axis, as `simulate` writes them into one table."""
+    """Columns of several axes, as `simulate` writes them into one table; by axis the result of each.
+
+    `out["z_pred_um"]` is a column, `out["z"]` the SimulationResult of an axis.
+    """
+
+    def __getitem__(self, name: str) -> Any:
+        return self.results[name] if name in self.results else self.table[name]
+
+    @property
+    def scores(self) -> dict[str, Scores | None]:
+        """Fit, rms and peak to peak of the residual of each axis, if it was measured."""
+        return {axis: result.scores for axis, result in self.results.items()}
 
     @property
     def table(self) -> dict[str, Vector]:
@@ -144,7 +155,7 @@ class SimulatedAxes(AxisResults[SimulationResult]):
 
         Raises
         ------
-        OSError
+        CompensatorError
             If the file cannot be written.
         """
         return write_curves(path, self.table)

@@ -80,8 +80,7 @@ def diagnose_files(
     if len(results) > 1:
         curves = curves.with_stem(f"{curves.stem}-AXIS")
     paths = {"model": str(model_file), "model_sha256": found.sha256, "report": str(page), "series": str(curves)}
-    pairs = [(one.diagnosis.model, one.diagnosis.evidence.model) for one in results]
-    added = any(extended.effects != base.effects or extended.dtf != base.dtf for extended, base in pairs)
+    added = any(one.diagnosis.model is not one.diagnosis.evidence.model for one in results)
     unchanged = "" if added else " (the given model: nothing was added to it)"
     text = f"{found.summary()}\n\nmodel: {model_file}{unchanged}\ncurves: {curves}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -32,7 +32,8 @@ def asked_axes(axis: AxisLike) -> tuple[str, ...]:
     >>> asked_axes("z"), asked_axes(["ch1", "ch2"]), asked_axes(None)
     (('z',), ('ch1', 'ch2'), ())
     """
-    asked = (axis,) if isinstance(axis, str) else tuple(axis or ())
+    is_one = isinstance(axis, str) or not isinstance(axis, Iterable)  # a number is no name of an axis, and said so
+    asked: tuple[Any, ...] = () if axis is None else (axis,) if is_one else tuple(axis)
     for name in asked:
         if not isinstance(name, str) or NAME.fullmatch(name) is None or name.endswith("_um"):
             raise UsageError(f"--axis {name}: expected the name of an axis, such as z, or ch1 for the column ch1_um")

@@ -20,7 +20,7 @@ from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
 from compensator.data.files import measured_probes
 from compensator.data.table import MEASURED_HEAT, QUALITY
-from compensator.errors import DataError
+from compensator.errors import DataError, of_files
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets, named_for, topic_of
 from compensator.recording.reading import machines_in, messages, recordings_in
@@ -37,6 +37,7 @@ _TOPICS = ("sample", "estimate", "offsets", *(topic_of(axis) for axis in UNITS),
 _OF_AXES = ("_dtf_", "_tdtf_", "_pred_", "_std_", "_ref_", "_residual_")
 
 
+@of_files()
 def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: str = "") -> int:
     """Write the recordings of one machine as one CSV, in the order of their samples.
 
@@ -63,11 +64,13 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
 
     Raises
     ------
-    DataError
-        If one is no recording or has no samples, or they are of several machines.
+    CompensatorError
+        If one is no recording or has no samples, they are of several machines, or the table cannot be written.
     """
     given = [recordings] if isinstance(recordings, (str, os.PathLike)) else recordings
     paths = recordings_in(map(Path, given))
+    if not paths:
+        raise DataError("recordings: empty, expected a recording, a folder of them, or a list of those")
     rows: dict[int, dict[str, Any]] = {}
     probes: list[list[Probe]] = []
     middles: dict[int, tuple[int, int]] = {}

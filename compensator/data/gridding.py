@@ -31,12 +31,16 @@ _MEASURED = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 999999.0, 32767.0, 3276.7, 6
 _TEMPERATURE, _APART = (850.0, 1370.0, 1372.0, 1768.0, -200.0, -242.0, -270.0), 3.0
 #: Number of stretches that a remark lists.
 _SHOWN = 3
+#: Temperatures that no model runs without.
+_INPUTS = ("t_q_degc", "at_degc")
 #: Share of rows without a temperature, outside long gaps, from which it is remarked on.
 _SPARSE = 0.1
 
 
 def to_grid(table: Table, period_s: float) -> SampledData:
     """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
+
+    Rows without T_Q or AT are a gap like rows that are missing: the model knows nothing there.
 
     Parameters
     ----------
@@ -81,24 +85,29 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     columns = {name: _mean_by_slot(slot, values[order], n) for name, values in table.columns.items()}
     present = np.zeros(n, dtype=bool)
     present[slot] = True
-    records = []
-    start = 0
     apart_s = _spacing(t_s) if t_s.size > 1 else 0.0
     usual = math.ceil(apart_s / period_s - 0.01) - 1
     gaps = [(first, last) for first, last in _gaps(present) if last - first > usual]
     if usual > 0:
         words = f"{table.name}: its rows are {apart_s:.0f} s apart, samples {period_s:g} s; bridged."
         remarks.append(Remark(DataRemark.ROWS_APART, words))
-    remarks += _bridged(table.name, [one for one in gaps if one[1] - one[0] <= SHORT_GAP_SAMPLES], period_s)
-    for first, last in gaps:
-        if last - first > SHORT_GAP_SAMPLES:
+    empty = {name: present & np.isnan(columns[name]) for name in _INPUTS if name in columns}
+    records = _between_long_gaps(present & ~np.any([*empty.values()], axis=0)) if empty else []
+    # Where no sample has both, what is missing is said by who needs it.
+    records = records or _between_long_gaps(present)
+    inside = np.zeros(n, dtype=bool)
+    for a, b in records:
+        inside[a:b] = True
+    remarks += _bridged(table.name, [one for one in gaps if inside[one[0]]], period_s)
+    for first, last in _gaps(inside):
+        # What is only one temperature's is said of it.
+        if not any(mask[first:last].all() for mask in empty.values()):
             gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
             remarks.append(Remark(DataRemark.GAP_SPLITS, f"{gap}; the record is split there."))
-            records.append((start, first))
-            start = last
-    records.append((start, n))
-    remarks += _missing_inputs(table.name, columns, records, period_s)
-    remarks += _sparse_inputs(table, slot, order, columns)
+    remarks += _missing_inputs(table.name, empty, period_s)
+    remarks += (sparse := list(_sparse_inputs(table, slot, order, columns)))
+    if not sparse:
+        remarks += _short_holes(table.name, {name: mask & inside for name, mask in empty.items()}, period_s)
     return SampledData(
         records=tuple(
             SampledRecord(
@@ -124,19 +133,34 @@ def _bridged(name: str, gaps: Sequence[tuple[int, int]], period_s: float) -> Ite
         yield Remark(DataRemark.GAP_BRIDGED, words)
 
 
-def _missing_inputs(
-    name: str, columns: Mapping[str, Vector], records: Sequence[tuple[int, int]], period_s: float
-) -> Iterator[Remark]:
+def _between_long_gaps(known: Mask) -> list[tuple[int, int]]:
+    """Return the first and past last sample of each stretch between long gaps; short ones stay, at the ends, too."""
+    if not known.any():
+        return []
+    long = [gap for gap in _gaps(known) if gap[1] - gap[0] > SHORT_GAP_SAMPLES]
+    edges = [0, *(edge for gap in long for edge in gap), known.size]
+    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
+
+
+def _short_holes(name: str, empty: Mapping[str, Mask], period_s: float) -> Iterator[Remark]:
+    """Yield one remark on all temperatures that are empty in samples of the records."""
+    holes = {column: np.flatnonzero(mask) for column, mask in empty.items()}
+    said = [f"{c} in {at.size} sample(s), first at t_s = {at[0] * period_s:g}" for c, at in holes.items() if at.size]
+    if said:
+        yield Remark(DataRemark.GAP_BRIDGED, f"{name}: empty: {'; '.join(said)}; bridged between known ones.")
+
+
+def _missing_inputs(name: str, empty: Mapping[str, Mask], period_s: float) -> Iterator[Remark]:
     """Yield a remark on each temperature that is missing for longer than what is bridged."""
-    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
-        known = ~np.isnan(columns[column])
-        gaps = [(a + first, a + last) for a, b in records for first, last in _gaps(known[a:b])]
-        long = [(first, last) for first, last in gaps if last - first > SHORT_GAP_SAMPLES]
+    for column, mask in empty.items():
+        long = [(first, last) for first, last in _gaps(~mask) if last - first > SHORT_GAP_SAMPLES]
         if long:
             hours = sum(last - first for first, last in long) * period_s / 3600.0
             where = ", ".join(f"{first * period_s:g}" for first, _ in long[:_SHOWN])
             more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
-            words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; not interpolated."
+            words = (
+                f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; the record is split there."
+            )
             yield Remark(DataRemark.TEMPERATURE_MISSING, words)
 
 
@@ -163,7 +187,7 @@ def _check_clock(table: Table, period_s: float) -> None:
 
 def _sparse_inputs(table: Table, slot: Indices, order: Indices, columns: Mapping[str, Vector]) -> Iterator[Remark]:
     """Yield a remark on each temperature that is missing in many rows, long gaps apart."""
-    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
+    for column in [c for c in _INPUTS if c in columns]:
         in_long_gap = np.zeros(columns[column].size, dtype=bool)
         for first, last in _gaps(~np.isnan(columns[column])):
             in_long_gap[first:last] = last - first > SHORT_GAP_SAMPLES

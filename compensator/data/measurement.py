@@ -25,6 +25,7 @@ from compensator.data.screening import check_deformation_scale, check_y_std, scr
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
 from compensator.input_file import read_file, sha256_of_file
+from compensator.options import check_types
 from compensator.recording.reading import recordings_in
 
 if TYPE_CHECKING:
@@ -192,6 +193,7 @@ def read(data: DataLike, *, columns: Mapping[str, str] | None = None, name: str 
     samples  2 of 60 s
     columns  at_degc, t_q_degc
     """
+    check_types(name=name)
     found = measurements(data, name, columns, needed=True)
     if len(found) != 1:
         raise DataError(f"{name}: {len(found)} tables, expected one; hand several runs over as a list")

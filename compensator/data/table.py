@@ -185,6 +185,8 @@ def table_of(
     cells = _with_time(name, cells, roles or {})
     time_column = next((column for column in TIMES if column in cells), None)
     if time_column is None:
+        if not cells:
+            raise DataError(f"{name}: no columns, expected t_s or time_utc and those of the roles")
         names = ", ".join(cells)[:100]
         raise DataError(
             f"{name}: no column t_s or time_utc; {has}: {names}. Name it with --column t_s=NAME, time_min=NAME or "

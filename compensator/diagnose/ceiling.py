@@ -54,7 +54,12 @@ class Ceiling:
 
 def named_rms(found: Mapping[str, Any]) -> float:
     """Return the error on held-out data with the named effects alone, µm rms."""
-    return float((found.get("remainder") or {}).get("rms_before_um", found["after"]["rms_um"]))
+    return float((found.get("remainder") or {}).get("rms_before_um", found_rms(found)))
+
+
+def found_rms(found: Mapping[str, Any]) -> float:
+    """Return the error on held-out data with everything that was found, deployed or not, µm rms."""
+    return float(found.get("refused", found["after"])["rms_um"])
 
 
 def _ceiling_in(found: Mapping[str, Any]) -> Ceiling | None:
@@ -130,7 +135,7 @@ def _of_all(found: Mapping[str, Any], best: Mapping[str, Any]) -> str:
             f"With the best linear combination of all logged channels, the error on held-out data is "
             f"{linear:.2f} µm rms, with the base model {base:.2f}."
         )
-    by = "the named effects" if named_rms(found) <= found["after"]["rms_um"] else "the remainder"
+    by = "the named effects" if named_rms(found) <= found_rms(found) else "the remainder"
     return (
         f"The smallest error on held-out data of all that was tried is {least:.2f} µm rms, with {by}. The "
         f"best linear combination of all logged channels, without names, leaves {linear:.2f}, the base model "

@@ -81,10 +81,22 @@ class Deployment:
         return not found.terms and found.remainder is None and found.refitted is not None
 
     @property
+    def refused(self) -> str:
+        """Why nothing is deployed, in words; empty where something is."""
+        if self.reverses_path:
+            return "a path would act the other way round"
+        if self.worse_um is not None:
+            return "the model with all that was found is worse in free run over the same data"
+        if self.too_short_h is not None:
+            return f"{self.too_short_h:.1f} h are too short for what they explain"
+        if self.contradicted:
+            return "held-out blocks contradict what was found"
+        return "paths fitted anew are all that was found" if self.explains_nothing else ""
+
+    @property
     def is_refused(self) -> bool:
         """Whether nothing is deployed."""
-        is_worse, is_too_short = self.worse_um is not None, self.too_short_h is not None
-        return self.contradicted or self.reverses_path or is_worse or is_too_short or self.explains_nothing
+        return self.refused != ""
 
     @property
     def needs_known_paths(self) -> bool:
@@ -115,7 +127,12 @@ def deployment_of(
     """
     decided = _decided(*_with_remainder_that_helps(found, effects, held_out), contradicts)
     decided = _by_channels(decided, contradicts) or decided
-    return dataclasses.replace(decided, effects=_not_replaced(decided.effects)) if decided.is_refused else decided
+    if not decided.is_refused:
+        return decided
+    effects = _not_replaced(decided.effects)
+    return dataclasses.replace(
+        decided, effects=tuple(dataclasses.replace(effect, refused=decided.refused) for effect in effects)
+    )
 
 
 def _decided(found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut, contradicts: float) -> Deployment:

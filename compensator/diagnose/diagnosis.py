@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -21,7 +21,7 @@ from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import CONTRADICTS, deployment_of, is_adequate
+from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of, is_adequate
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, in_free_run
@@ -32,7 +32,7 @@ from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Diagnosis, Remainder, Verdict, warnings_of
+from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
 from compensator.diagnose.search import Candidate
@@ -153,7 +153,11 @@ def _diagnosed(
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model
-    extended = _with_deviation(extended, model, found, effects, held_out)
+    deviation_um = _deviation_um(extended, model, found, effects, held_out)
+    if deployed:
+        extended = dataclasses.replace(extended, y_std_um=deviation_um, sha256="")
+    else:
+        remarks = tuple(_deviation_contradicted(model.y_std_um, deviation_um))
     ceiling = _ceiling(held_out)
     verdict, is_explained = _verdict(
         found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None, is_off=is_off
@@ -171,6 +175,7 @@ def _diagnosed(
         advice = advice_of(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
         )
+    refused = _refused(chosen)
     left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     warnings = warnings_of(
@@ -186,7 +191,7 @@ def _diagnosed(
     return Diagnosis(
         verdict="unexplained" if hides or chosen.reverses_path else verdict,
         effects=effects,
-        held_out=how_held_out(evidence),
+        held_out=how_held_out(evidence, () if refused else _of_no_model(effects)),
         model=extended,
         evidence=evidence,
         residual_before=np.where(evidence.used, evidence.without_nuisances(before), np.nan),
@@ -196,7 +201,7 @@ def _diagnosed(
         named_rms_um=rms_of(evidence.left(found.named)[evidence.used]),
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
-        held_out_after=held_out.whole,
+        held_out_after=held_out.nothing if refused else held_out.whole,
         tried=_ranked(found, effects),
         warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off), *warnings),
         steps=held_out.steps,
@@ -204,7 +209,19 @@ def _diagnosed(
         ceiling=ceiling,
         advice=advice,
         could_hide=could_hide,
+        refused=refused,
     )
+
+
+def _refused(chosen: Deployment) -> Refused | None:
+    """Return what a model could have of what was found, where none of it is deployed."""
+    has_any = chosen.found.remainder is not None or any(effect.is_refused for effect in chosen.effects)
+    return Refused(why=chosen.refused, held_out=chosen.held_out.whole) if chosen.is_refused and has_any else None
+
+
+def _of_no_model(effects: Sequence[FoundEffect]) -> list[str]:
+    """Return the kinds of effects that no model can have, and in whose place no remainder stands."""
+    return sorted({effect.kind for effect in effects if not effect.effect.deployable and not effect.replaced})
 
 
 def _as_begun(found: Findings) -> Findings:
@@ -369,13 +386,20 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
     ]
 
 
-def _with_deviation(
-    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
-) -> ThermalModel:
-    """Return a model with the standard deviation of its own error that the data show.
+def _deviation_contradicted(stated_um: float, shown_um: float) -> Iterator[Remark]:
+    """Yield a remark where the data contradict the deviation that a model states to which nothing is added."""
+    if shown_um > VERDICT_TIMES * stated_um or stated_um > VERDICT_TIMES * shown_um:
+        text = (
+            f"The model states {stated_um:.2f} µm as the standard deviation of its own error; these data show "
+            f"{shown_um:.2f} µm. It was left as it is."
+        )
+        yield Remark(ModelWarning.DEVIATION_CONTRADICTED, text)
 
-    Where nothing is deployed, what the model stated is replaced only if the data contradict it.
-    """
+
+def _deviation_um(
+    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
+) -> float:
+    """Return the standard deviation of a model's own error that the data show, µm."""
     evidence, deploys = found.search.evidence, extended is not model
     # What depends on time alone is an error of the measurement: it is not in the machine that the model runs on.
     of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
@@ -396,10 +420,7 @@ def _with_deviation(
         left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.
     late = late_variance_um2(extended) - late_variance_um2(model)
-    left = max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)
-    if not deploys and left <= VERDICT_TIMES**2 * model.y_std_um**2 and model.y_std_um**2 <= VERDICT_TIMES**2 * left:
-        return model
-    return dataclasses.replace(extended, y_std_um=float(np.sqrt(left)), sha256="")
+    return float(np.sqrt(max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)))
 
 
 def _refitted(old: ThermalModel, new: ThermalModel) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.axes import FIRST
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
@@ -28,6 +29,8 @@ REPLACED = " A regularised response does better than the names, so the remainder
 MADE_UP_FOR = " All channels together make up for it: the remainder is deployed in its place, and explains nothing."
 #: Said of a late T_Q that is left in.
 LEFT_IN = " A correction in real time would make more errors on this record than it removes, so T_Q is used as it is."
+#: Said of an effect of a kind that a model can have, where nothing of what was found is deployed.
+REFUSED = " Not deployed: {why}."
 #: Another explanation is a rival while it leaves no more than this many times as much, and while the logarithm of the
 #: evidence is smaller by no more than this: four times what decides, since forms are known approximately only.
 RIVAL_TIMES, RIVAL_EVIDENCE = 1.2, 20.0
@@ -55,6 +58,10 @@ class FoundEffect:
         Whether the remainder is deployed in its place, since it explains the data better.
     left_in : bool
         Whether it is a late T_Q whose correction is not deployed, since the model is better without it.
+    axis : str
+        The axis that it moves.
+    refused : str
+        Why nothing of what was found is deployed, in words; empty where something is.
     """
 
     term: Term = field(repr=False)
@@ -65,6 +72,8 @@ class FoundEffect:
     rivals: tuple[Rival, ...] = field(repr=False)
     replaced: bool = False
     left_in: bool = False
+    refused: str = ""
+    axis: str = FIRST
 
     def __getitem__(self, key: str) -> Any:
         return getattr(self, key)
@@ -120,9 +129,11 @@ class FoundEffect:
         words = self.effect.explanation
         if self.left_in:
             words = words.replace(CORRECTED, LEFT_IN)
-        if not self.replaced:
-            return words
-        return words.replace(NEEDS_CHANNEL, "") + (REPLACED if self.effect.observed else MADE_UP_FOR)
+        if self.replaced:
+            return words.replace(NEEDS_CHANNEL, "") + (REPLACED if self.effect.observed else MADE_UP_FOR)
+        if self.is_refused:
+            return words.replace(NEEDS_CHANNEL, "").replace(CORRECTED, "") + REFUSED.format(why=self.refused)
+        return words
 
     @property
     def removed(self) -> Vector:
@@ -131,8 +142,13 @@ class FoundEffect:
 
     @property
     def deployable(self) -> bool:
-        """Whether the service can run it."""
-        return self.effect.deployable and not self.replaced and not self.left_in
+        """Whether the extended model has it: the service can run its kind, and nothing speaks against it."""
+        return self.effect.deployable and not self.replaced and not self.left_in and not self.refused
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the extended model would have it, if anything of what was found were deployed."""
+        return bool(self.refused) and dataclasses.replace(self, refused="").deployable
 
     @property
     def is_determined(self) -> bool:

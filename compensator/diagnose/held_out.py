@@ -18,6 +18,7 @@ from compensator.diagnose.own_error import own_error_alone
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Grid
 from compensator.diagnose.whitening import Whitening
+from compensator.display import listed
 from compensator.model.effects.hypothesis import Place
 from compensator.progress import ExecutorMap, Progress
 
@@ -36,6 +37,9 @@ HELD_OUT_VALUES = (
 )
 #: How the errors are measured where nothing was known of the paths.
 WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
+
+#: What the error after also has, where an effect was found that no model can have.
+WITH_KINDS = "; after: also with {kinds}, which no model can have"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,10 +207,11 @@ class _Nuisances:
         return np.asarray(added + self._table @ weights)
 
 
-def how_held_out(evidence: Evidence) -> str:
-    """Return how the errors are measured."""
+def how_held_out(evidence: Evidence, beside: Sequence[str] = ()) -> str:
+    """Return how the errors are measured; `beside`: kinds that no model can have, and that count as explained."""
     count = len(list(evidence.blocks(FOLDS)))
     words = HELD_OUT_VALUES if evidence.is_sparse else HELD_OUT
     if evidence.holds_out_recordings:
         words = HELD_OUT_RECORDINGS.format(count=count)
-    return words + WITH_PATHS * evidence.free_paths
+    words += WITH_PATHS * evidence.free_paths
+    return words + (WITH_KINDS.format(kinds=listed(list(beside))) if beside else "")

@@ -82,7 +82,7 @@ def explains_better(later: Diagnosis, all_data: Diagnosis) -> bool:
     if _is_of_measurement(later):
         # A period that has come once or twice looks like anything slow.
         is_period = any(isinstance(effect.effect, Periodic) for effect in later.effects)
-        if not is_period and any(all_data.deploys(effect) for effect in all_data.effects):
+        if not is_period and any(effect.deployable for effect in all_data.effects):
             left = _part(later, later.named.rms_um)
     elif later.effects and all(_acts(effect) and effect.is_determined for effect in later.effects):
         left = left_part(later)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -53,6 +52,22 @@ class Remainder:
     confirmed: float = 1.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refused:
+    """What was found and is not deployed: nothing was added to the model.
+
+    Parameters
+    ----------
+    why : str
+        In words.
+    held_out : numpy.ndarray, shape (n,)
+        What it would leave, each block by a search that did not see it, µm.
+    """
+
+    why: str
+    held_out: Vector
+
+
 #: An error is said to be worse from this many times another one on.
 CLEARLY_WORSE = 1.05
 
@@ -86,7 +101,7 @@ class Diagnosis:
     held_out : str
         How the errors before and after were measured.
     model : ThermalModel
-        The base model with every deployable effect.
+        The base model with every deployable effect; the base itself where nothing was added.
     evidence : Evidence
         Residual and signals.
     residual_before, residual_after : numpy.ndarray, shape (n,)
@@ -98,7 +113,8 @@ class Diagnosis:
     named_rms_um : float
         Residual of the fit with the named effects and without a remainder, µm.
     held_out_before, held_out_named, held_out_after : numpy.ndarray, shape (n,)
-        Before, with the named effects, and with the remainder, too, each block by a search that did not see it.
+        Before, with the named effects, and after, each block by a search that did not see it. After: with every effect
+        that the model has or that no model can have, and the remainder; as before where what was found is refused.
     steps : tuple of Step
         The error on held-out data with the first effect, the first two, and so on (`stepped`).
     tried : tuple of (str, float)
@@ -115,6 +131,8 @@ class Diagnosis:
         Where Y was measured now and then: how much could act without being seen.
     since_h : float
         From when on measured Y was searched, h after the start of the data: an effect began then (`onset`).
+    refused : Refused, optional
+        What a model could have of what was found, where none of it is deployed.
     """
 
     verdict: Verdict
@@ -138,6 +156,7 @@ class Diagnosis:
     advice: Advice | None = None
     could_hide: DetectionLimits | None = None
     since_h: float = 0.0
+    refused: Refused | None = None
 
     @property
     def shows_nothing(self) -> bool:
@@ -158,8 +177,18 @@ class Diagnosis:
 
     @property
     def after(self) -> Scores:
-        """The same with every effect and the remainder."""
+        """The same with the extended model, and with what no model can have (`held_out`)."""
         return self._scores(self.held_out_after)
+
+    @property
+    def held_out_found(self) -> Vector:
+        """What is left on held-out data with everything that was found, deployed or not, µm."""
+        return self.held_out_after if self.refused is None else self.refused.held_out
+
+    @property
+    def found(self) -> Scores:
+        """The same in figures."""
+        return self._scores(self.held_out_found)
 
     @property
     def noise_floor_um(self) -> float:
@@ -175,13 +204,6 @@ class Diagnosis:
     def stepped(self) -> tuple[FoundEffect, ...]:
         """The effects of `steps`: all but a late T_Q that is left in."""
         return tuple(effect for effect in self.effects if not effect.left_in)
-
-    def deploys(self, effect: FoundEffect) -> bool:
-        """Return whether the extended model has an effect."""
-        # There it also has what the data leave open of all parameters together.
-        return any(
-            dataclasses.replace(one, std_factor=effect.effect.std_factor) == effect.effect for one in self.model.effects
-        )
 
     def _scores(self, residual: Vector) -> Scores:
         y = self.evidence.y_um

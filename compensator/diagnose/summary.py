@@ -13,7 +13,16 @@ from compensator.arrays import rms_of
 from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
-from compensator.diagnose.ceiling import Ceiling, ceiling, explained, falls_short, lowers, named_rms, remainder
+from compensator.diagnose.ceiling import (
+    Ceiling,
+    ceiling,
+    explained,
+    falls_short,
+    found_rms,
+    lowers,
+    named_rms,
+    remainder,
+)
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
@@ -132,6 +141,7 @@ def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dic
         ],
         "before": _scores(diagnosis.before),
         "after": _scores(diagnosis.after),
+        **({"refused": {"why": refused.why, **_scores(diagnosis.found)}} if (refused := diagnosis.refused) else {}),
         "held_out": diagnosis.held_out,
         "noise_floor_um": diagnosis.noise_floor_um,
         "fit": {
@@ -217,9 +227,10 @@ def verdict(found: Mapping[str, Any]) -> str:
     if not found["effects"]:
         return _residual(found) + share
     named = f"{_names(found['effects'])}{_since(found)}"
+    does = "would be" if "refused" in found else "is"
     return (
         f"{_words(found)} {named}. On held-out data, with a fitted zero, the residual was "
-        f"{found['before']['rms_um']:.2f} µm rms without and is {named_rms(found):.2f} µm rms with them"
+        f"{found['before']['rms_um']:.2f} µm rms without and {does} {named_rms(found):.2f} µm rms with them"
         f"{_with_remainder(found)} (sensor noise {found['noise_floor_um']:.2f}).{share}"
     )
 
@@ -240,7 +251,7 @@ def _residual(found: Mapping[str, Any]) -> str:
 
 
 def _with_remainder(found: Mapping[str, Any]) -> str:
-    return f", {found['after']['rms_um']:.2f} with the remainder" if found.get("remainder") else ""
+    return f", {found_rms(found):.2f} with the remainder" if found.get("remainder") else ""
 
 
 def _words(found: Mapping[str, Any]) -> str:
@@ -345,7 +356,7 @@ def contents(
     yield error_table(diagnosis)
     yield ceiling(found)
     for i, effect in enumerate(diagnosis.effects, start=1):
-        yield explanation(diagnosis, effect, title=f"{i}. {name(effect).replace(': ', ' ')}")
+        yield explanation(effect, title=f"{i}. {name(effect).replace(': ', ' ')}")
         yield parameter_table(effect, count=SHOWN)
         if effect.rivals:
             yield rivals(effect)
@@ -385,10 +396,12 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if len(diagnosis.effects) > 1:
         pairs = zip(diagnosis.stepped, diagnosis.steps, strict=False)
         rows += [[f"+ {name(effect)}", f"{step.rms_um:.2f}", "", ""] for effect, step in pairs]
+    refused = " (not deployed)" if diagnosis.refused else ""
     if diagnosis.effects:
-        rows.append(["with the effects", *(diagnosis.named if diagnosis.remainder else diagnosis.after).cells()])
+        named = diagnosis.named if diagnosis.remainder else diagnosis.found
+        rows.append([f"with the effects{refused}", *named.cells()])
     if diagnosis.remainder:
-        rows.append(["with the remainder", *diagnosis.after.cells()])
+        rows.append([f"with the remainder{refused}", *diagnosis.found.cells()])
     if diagnosis.ceiling:
         rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
@@ -409,14 +422,14 @@ def parameter_table(effect: FoundEffect, *, count: int | None = None) -> Table:
     return Table(head=["parameter", "value ± standard error"], rows=rows)
 
 
-def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Explanation") -> Words:
+def explanation(effect: FoundEffect, *, title: str = "Explanation") -> Words:
     """Return the explanation of an effect, and whether the extended model has it."""
-    if diagnosis.deploys(effect):
+    if effect.deployable:
         deploy = "Deployed in the extended model."
     elif effect.replaced or effect.left_in:
         deploy = "Not in the extended model."
-    elif effect.deployable:
-        deploy = "Not deployed: the model was left unchanged."
+    elif effect.is_refused:
+        deploy = "The model was left unchanged."
     else:
         deploy = "Not deployable, so not in the extended model."
     return Words(title=title, lines=[effect.explanation, deploy])

@@ -165,10 +165,12 @@ def parse_axes(data: bytes, *, source: str) -> dict[str, ThermalModel]:
     sha256 = hashlib.sha256(data).hexdigest()
     try:
         if "axis" not in table:
-            return {FIRST: _model(table, sha256)}
-        return {axis: _of_axis(axis, own, sha256) for axis, own in _parts(table).items()}
+            models = {FIRST: _model(table, sha256)}
+        else:
+            models = {axis: _of_axis(axis, own, sha256) for axis, own in _parts(table).items()}
     except CompensatorError as error:
         raise ModelError(f"{source}: {error}") from error
+    return {axis: replace(model, file=data) for axis, model in models.items()}
 
 
 def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -25,7 +25,7 @@ _SHARED = ("name", "kind", "period_s", "inputs", "ttf", "estimator", "validity")
 
 
 def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
-    """Write a model file atomically.
+    """Write a model file atomically; a model as it was read, with the bytes of its own file.
 
     Parameters
     ----------
@@ -57,12 +57,28 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
 
 def write_axes(path: FilePath, models: Mapping[str, ThermalModel]) -> dict[str, ThermalModel]:
     """Write the models of all axes into one file; as `write_model`."""
-    text = dump_axes(models)
+    data = bytes_of(models)
     # Before the old file is replaced: the reader knows bounds that the model does not.
-    parse_axes(text.encode("utf-8"), source=str(path))
+    parse_axes(data, source=str(path))
     with atomic_write(path) as file:
-        file.write(text)
+        file.write(data.decode("utf-8"))
     return load_axes(path.absolute())  # a bare "quill" is the name of a built-in model
+
+
+def bytes_of(models: Mapping[str, ThermalModel]) -> bytes:
+    """Return the bytes of the file of the models of all axes.
+
+    Of models as they were read, their own file: its hash is known, and its comments are somebody's.
+
+    Raises
+    ------
+    ModelError
+        As `dump_axes`.
+    """
+    own = next(iter(models.values())).file
+    if own and parse_axes(own, source="model") == dict(models):
+        return own
+    return dump_axes(models).encode("utf-8")
 
 
 def dump_model(model: ThermalModel) -> str:

@@ -181,11 +181,11 @@ def scores(y: Vector, y_pred: Vector) -> Scores:
 
 
 def csv_rows(columns: dict[str, Vector]) -> Iterator[list[str]]:
-    """Yield a header and rows; a missing value is an empty cell."""
+    """Yield a header and rows, each value as it reads back to the last digit; a missing one is an empty cell."""
     yield list(columns)
     for i in range(columns["t_s"].size):
         yield [_shown(values[i]) for values in columns.values()]
 
 
 def _shown(value: float) -> str:
-    return "" if math.isnan(value) else repr(round(float(value), 9))
+    return "" if math.isnan(value) else repr(float(value))

@@ -165,6 +165,8 @@ class ThermalModel(Shown):
         Where it comes from: source, date, hash of the data, fits.
     sha256 : str
         Hash of the model file's bytes; empty for a model that was not read from a file.
+    file : bytes
+        Those bytes; what was changed since is another model.
     axis : str
         The axis whose deformation it gives.
     parts : tuple of ThermalModel
@@ -188,6 +190,7 @@ class ThermalModel(Shown):
     alternatives: Mapping[str, tuple[str, Path]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
+    file: bytes = field(default=b"", compare=False)
     axis: str = FIRST
     parts: tuple[ThermalModel, ...] = ()
     outputs: tuple[Output, ...] = ()

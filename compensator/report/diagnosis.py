@@ -75,6 +75,7 @@ def page_of(
     free_run: Sequence[FreeRunErrors] = (),
     *,
     since_utc_s: float | None = None,
+    sources: Sequence[Mapping[str, Any]] = (),
 ) -> Page:
     """Make the page.
 
@@ -90,6 +91,8 @@ def page_of(
         Errors of both models in free run as the service runs.
     since_utc_s : float, optional
         When the data begin, s since 1970 UTC.
+    sources : sequence of mapping
+        Name and hash of the data.
     """
     time = TimeAxis.of(diagnosis, since_utc_s)
     found = figures(diagnosis, free_run)
@@ -107,9 +110,8 @@ def page_of(
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
-    blocks.append(_details(time, diagnosis, model, remarks))
+    blocks.append(_details(time, diagnosis, model, remarks, sources))
     title = f"Diagnosis: what {model.name} lacks"
-    sources = model.provenance.get("diagnosis", {}).get("data", [])
     return Page(title=title, verdict=headline(found), blocks=blocks, tone=tone_of(found), data=files_of(sources))
 
 
@@ -128,7 +130,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     effects = "effect" if one else "all effects"
     if refitted:
         effects += ", with the paths refitted"
-    inside = [diagnosis.deploys(effect) for effect in diagnosis.effects]
+    inside = [effect.deployable for effect in diagnosis.effects]
     if not all(inside):
         effects += " (not in the extended model)" if not any(inside) else " (not all in the extended model)"
     lines = [
@@ -160,7 +162,8 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         parts = ["the remainder, in place of the effects"] if remainder.instead else [*parts, "the remainder"]
     lines = [time.line("before" if parts else "base model", diagnosis.held_out_before)]
     if parts:
-        lines.append(time.line(f"after: {' and '.join(parts)}", diagnosis.held_out_after))
+        with_it = "with what is not deployed" if diagnosis.refused else "after"
+        lines.append(time.line(f"{with_it}: {' and '.join(parts)}", diagnosis.held_out_found))
     return Figure(
         title=f"Residual{' before and after the extension' if parts else ''} on held-out data",
         x_label=time.label,
@@ -173,7 +176,7 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
 
 
 def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [explanation(diagnosis, effect)]
+    blocks: list[Block] = [explanation(effect)]
     if len(diagnosis.effects) > 1:
         # The only effect is in the first picture.
         blocks.append(_effect_figure(time, diagnosis, effect))
@@ -201,7 +204,7 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
                 "residual without it", diagnosis.residual_after + diagnosis.remainder_um + effect.removed, weight=0.9
             ),
             time.line(
-                "effect" if diagnosis.deploys(effect) else "effect (not in the extended model)",
+                "effect" if effect.deployable else "effect (not in the extended model)",
                 effect.signal,
                 weight=2.2,
             ),
@@ -252,15 +255,18 @@ def _ranking(diagnosis: Diagnosis) -> Details:
     )
 
 
-def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
+def _details(
+    time: TimeAxis,
+    diagnosis: Diagnosis,
+    model: ThermalModel,
+    remarks: Sequence[str],
+    sources: Sequence[Mapping[str, Any]],
+) -> Details:
     rows = [
         ["extended model, SHA-256", model.sha256],
         ["standard deviation that it states, µm", f"{model.y_std_um:.2f}"],
     ]
-    rows += [
-        [f"data: {d.get('file') or d['table']}", d["sha256"]]
-        for d in model.provenance.get("diagnosis", {}).get("data", [])
-    ]
+    rows += [[f"data: {one.get('file') or one['table']}", one["sha256"]] for one in sources]
     figure = Figure(
         title="Residual of the fit to all data",
         x_label=time.label,

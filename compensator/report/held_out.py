@@ -34,7 +34,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     diagnosis : Diagnosis
         The diagnosis.
     """
-    before, after = rms_of(diagnosis.held_out_before), rms_of(diagnosis.held_out_after)
+    before, after = rms_of(diagnosis.held_out_before), rms_of(diagnosis.held_out_found)
     count = len(list(diagnosis.evidence.blocks(FOLDS)))
     bars = [Bar("base model", f"{before:.2f} µm", 0.0, before, _LEFT)]
 

@@ -115,18 +115,23 @@ def test_a_date_and_time_of_another_name_gives_results_by_time(run: Path, as_ind
     assert tc.simulate("quill", local, columns=columns).index[0] == START.tz_localize(None)
 
 
-def test_a_temperature_that_is_missing_for_long_is_remarked_and_not_interpolated() -> None:
+def test_a_temperature_that_is_missing_for_long_splits_the_record_as_missing_rows_do() -> None:
     n = 1200
     table = {"t_s": 60.0 * np.arange(n), "t_q_degc": 20.0 + np.arange(n) / 50.0, "at_degc": np.full(n, 20.0)}
     for first, last in ((100, 160), (200, 290), (400, 461)):  # the first is bridged
         table["t_q_degc"][first:last] = np.nan
     data = tc.read(table).at_period(60.0)
-    assert [remark.code for remark in data.remarks] == ["temperature_missing"]
-    assert "data: t_q_degc is missing for 2.5 h from t_s = 12000, 24000; not interpolated" in data.remarks[0]
-    assert np.isnan(data.records[0].columns["t_q_degc"][200:290]).all()
+    assert [remark.code for remark in data.remarks] == ["temperature_missing", "gap_bridged"]
+    assert "t_q_degc is missing for 2.5 h from t_s = 12000, 24000; the record is split there" in data.remarks[0]
+    assert "empty: t_q_degc in 60 sample(s), first at t_s = 6000; bridged" in data.remarks[1]
     found = tc.simulate("quill", table)
     assert "temperature_missing" in [remark.code for remark in found.remarks]
-    assert found["y_std_um"][280] > 1.5 * found["y_std_um"][190]
+    kept = np.ones(n, dtype=bool)
+    kept[200:290] = kept[400:461] = False
+    without = tc.simulate("quill", {name: values[kept] for name, values in table.items()})
+    assert found.records == without.records == 3
+    np.testing.assert_array_equal(found["t_s"], without["t_s"])
+    np.testing.assert_array_equal(found["y_pred_um"], without["y_pred_um"])
 
 
 def test_a_run_shows_itself() -> None:

@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import pickle
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,31 @@ def test_a_folder_that_does_not_exist_is_refused_and_not_made(table: pd.DataFram
             with pytest.raises(tc.CompensatorError, match=r"absent/\S+: (no such folder|expected a name)"):
                 save(tmp_path / "absent" / name)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda run: tc.identify(run, folds="x"), "folds = 'x', expected an integer"),
+        (lambda run: tc.identify(run, folds=2.5), "folds = 2.5, expected an integer"),
+        (lambda run: tc.identify(run, etve_end_h="x"), "etve_end_h = 'x', expected a number"),
+        (lambda run: tc.identify(run, axis=5), "--axis 5: expected the name of an axis"),
+        (lambda run: tc.identify(run, name=5), "name = 5, expected a text"),
+        (lambda run: tc.read(run, name=5), "name = 5, expected a text"),
+        (lambda run: tc.diagnose("quill", run, fit_until_h="x"), "fit_until_h = 'x', expected a number"),
+        (lambda run: tc.compare({"a": "quill"}, run, from_h="x"), "from_h = 'x', expected a number"),
+        (lambda run: tc.compare({}, run), "compare: no models, expected one at least"),
+        (lambda run: tc.simulate("quill", {}), "data: no columns, expected t_s or time_utc"),
+        (lambda run: tc.export([], "out.csv"), "recordings: empty, expected a recording"),
+        (lambda run: tc.simulate("quill", run).result.save("/proc/out.csv"), "/proc/out.csv: No such file"),
+        (lambda run: tc.simulate("quill", run).result.save("/proc"), "/proc: not a regular file"),
+        (lambda run: tc.compare({"a": "quill"}, run).save("/proc"), "/proc: not a regular file"),
+        (lambda run: tc.compare({"a": "quill"}, run).page("/proc/out.html"), "/proc/out.html: No such file"),
+        (lambda run: tc.identify(run, order=(2, 2, 2)).save("/proc"), "/proc: not a regular file"),
+    ],
+)
+def test_what_python_or_the_system_refuses_is_said_as_the_commands_do(
+    table: pd.DataFrame, call: Callable[[pd.DataFrame], object], words: str
+) -> None:
+    with pytest.raises(tc.CompensatorError, match="^" + re.escape(words)):
+        call(table)

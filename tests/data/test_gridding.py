@@ -24,8 +24,9 @@ def remarks(path: Path, rows: list[str]) -> list[Remark]:
     return list(read(path).at_period(60.0).remarks)
 
 
-def row(i: int, *, t_s: float | None = None, t_q: bool = True) -> str:
-    return f"{60.0 * i if t_s is None else t_s},{20.0 + 0.01 * i if t_q else ''},20.0,{0.1 * i}"
+def row(i: int, *, t_s: float | None = None, t_q: bool = True, at: bool = True, y: bool = True) -> str:
+    values = (20.0 + 0.01 * i if t_q else "", 20.0 if at else "", 0.1 * i if y else "")
+    return ",".join(map(str, (60.0 * i if t_s is None else t_s, *values)))
 
 
 def test_a_table_in_order_has_no_remark(tmp_path: Path) -> None:
@@ -43,7 +44,7 @@ def test_rows_with_equal_times_are_counted_and_the_first_is_named(tmp_path: Path
 @pytest.mark.parametrize(("every", "percent"), [(2, "50 %"), (4, "25 %"), (20, "")])
 def test_a_sparse_temperature_is_said_with_its_share(tmp_path: Path, every: int, percent: str) -> None:
     found = remarks(tmp_path / "a.csv", [row(i, t_q=i % every != 1) for i in range(ROWS)])
-    assert [one.code for one in found] == (["temperature_sparse"] if percent else [])
+    assert [one.code for one in found] == (["temperature_sparse"] if percent else ["gap_bridged"])
     assert percent in str(found[:1])
 
 
@@ -81,6 +82,21 @@ def test_every_row_of_a_log_with_rows_further_apart_counts(every: int) -> None:
 def test_a_long_gap_is_said_once(tmp_path: Path) -> None:
     found = remarks(tmp_path / "a.csv", [row(i, t_q=not 60 <= i < 160) for i in range(ROWS)])
     assert [one.code for one in found] == ["temperature_missing"]
+
+
+def test_short_holes_of_the_temperatures_are_said_in_one_line(tmp_path: Path) -> None:
+    """In the middle and at the start; Y that is empty now and then is no gap."""
+    rows = [row(i, t_q=i not in (0, 1, 70), at=i != 90, y=i != 80) for i in range(ROWS)]
+    [said] = remarks(tmp_path / "a.csv", rows)
+    assert said.code == "gap_bridged"
+    assert "t_q_degc in 3 sample(s), first at t_s = 0; at_degc in 1 sample(s), first at t_s = 5400" in said
+
+
+def test_rows_and_cells_that_are_missing_make_one_gap(tmp_path: Path) -> None:
+    """Each of them alone would be bridged."""
+    rows = [row(i, t_q=not 100 <= i < 140) for i in range(ROWS) if not 60 <= i < 100]
+    [said] = remarks(tmp_path / "a.csv", rows)
+    assert said.code == "gap_splits" and "gap of 80 sample(s) from t_s = 3600" in said
 
 
 @pytest.mark.parametrize("row_s", [15.0, 60.0])

@@ -5,6 +5,7 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import compensator as tc
@@ -72,6 +73,25 @@ def test_each_axis_gets_its_own_effect_in_one_file(found, files, tmp_path):
         assert after[axis].scores.rms_about_mean_um < 0.4 * before[axis].scores.rms_about_mean_um, axis
 
 
+def test_what_is_asked_of_one_axis_is_answered_by_several(found, files):
+    named = [(effect["axis"], effect["kind"], effect.channel) for effect in found.effects]
+    listed = [(one["axis"], one["kind"], one["channel"]) for one in found.to_dict()["effects"]]
+    top, own = found.to_dict(), found["y"].to_dict()
+    keys = ("before", "after", "held_out", "noise_floor_um", "remainder", "ceiling")
+    assert top["figures_of"] == "y" and all(top[key] == own[key] for key in keys)
+    assert named == listed == [("y", "input", "coolant_degc"), ("z", "input", "coolant_degc")]
+    base, table = files
+    out = tc.simulate(base, table)
+    assert out["y_pred_um"] is out["y"]["y_pred_um"] and out["z_pred_um"].size == out["t_s"].size
+    assert list(out) == ["x", "y", "z"] and set(out.scores) == set(out)
+    with pytest.raises(KeyError):
+        out["b_pred_urad"]
+    frame = tc.simulate(base, pd.read_csv(table))
+    assert isinstance(frame, pd.DataFrame) and list(frame) == list(out.table)
+    np.testing.assert_array_equal(frame["z_pred_um"], out["z_pred_um"])
+    assert frame.result["z"].scores == out["z"].scores == frame.scores["z"]
+
+
 def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch):
     """Another axis has shown an effect that this one may have, too."""
     told = []
@@ -93,11 +113,16 @@ def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch
     assert told == [(0, 12), (4, 12), (4, 12), (8, 12), (8, 12), (12, 12), (12, 16), (16, 16)]
 
 
-def test_a_jump_of_one_axis_is_first_suspected_in_its_probe():
-    found = tc.diagnose(models(), machine(2, {}, step_um={"z": 8.0}, hours=12.0))
+def test_a_jump_of_one_axis_is_first_suspected_in_its_probe(tmp_path):
+    base, written = tmp_path / "base.toml", tmp_path / "model.toml"
+    write_axes(base, models())
+    base.write_bytes(b"# of the old machine\n" + base.read_bytes())
+    found = tc.diagnose(base, machine(2, {}, step_um={"z": 8.0}, hours=12.0))
     [effect] = found.machine
     assert effect.place[0] == "step" and effect.suspect == "z"
     assert "Only Z shows it" in effect.sentence and "Check the probe of Z first" in effect.sentence
+    # Nothing is added to any axis: the file stays.
+    assert found.save(written).read_bytes() == base.read_bytes() and found.sha256 == load_axes(base)["y"].sha256
 
 
 def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():

@@ -8,10 +8,11 @@ import json
 import numpy as np
 import pytest
 
+import compensator as tc
 from compensator.cli import main
 from compensator.demo.calibration import write_table
-from compensator.model.model_file import load_model
-from compensator.model.model_writer import write_model
+from compensator.model.model_file import load_model, read_model_bytes
+from compensator.model.model_writer import dump_model, write_model
 from tests.diagnose.scenarios import draw, record
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
@@ -57,7 +58,8 @@ def test_json_model_and_page(first, base):
         assert effect["rms_after_um"] < effect["rms_before_um"]
         for value in effect["parameters"].values():
             assert 0.0 < value["std"] < abs(value["value"])
-    assert found["after"]["rms_um"] < found["before"]["rms_um"]
+    assert found["after"]["rms_um"] < found["before"]["rms_um"] and "refused" not in found
+    assert found["held_out"].endswith("; after: also with drift, which no model can have")
     assert all({"kind", "channel", "rms_after_um", "how_to_tell_apart"} <= set(rival) for rival in found["rivals"])
     model = load_model(out / "model.toml")
     assert [effect.kind for effect in model.effects] == ["scheduled"]
@@ -80,21 +82,29 @@ def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, first, cap
     assert main(["simulate", str(table), "--model", str(out / "model.toml"), "--out", str(tmp_path / "s.csv")]) == 0
 
 
-def test_an_adequate_model_is_written_with_the_deviation_that_the_data_show(tmp_path, capsys):
+def test_a_model_that_lacks_nothing_is_written_as_its_own_file(tmp_path, capsys):
     columns, _, _ = record([], 78, 14.0)
     path = tmp_path / "run.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
     assert main(["diagnose", str(path), "--model", "quill", "--out", str(tmp_path / "d"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["verdict"] == "adequate"
-    model = load_model(tmp_path / "d" / "model.toml")
-    assert (model.dtf, model.effects) == (load_model("quill").dtf, ())
-    # The published model states 2.3 µm; on a machine that it describes exactly nothing of that is left.
-    assert load_model("quill").y_std_um > 2.0
-    assert model.y_std_um < 0.3
-    # What the data do not contradict stays: the same model again.
-    again = tmp_path / "again"
-    assert main(["diagnose", str(path), "--model", str(tmp_path / "d" / "model.toml"), "--out", str(again)]) == 0
-    assert load_model(again / "model.toml").y_std_um == model.y_std_um
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "adequate" and found["model_sha256"] == load_model("quill").sha256
+    # With its comments, and without an entry of a diagnosis that added nothing.
+    written = tmp_path / "d" / "model.toml"
+    assert written.read_bytes() == read_model_bytes("quill")
+    assert "data: run.csv" in (tmp_path / "d" / "report.html").read_text(encoding="utf-8")
+    assert list(found["free_run"][0]["scores"]) == ["base model", "no compensation", "persistence"]
+    # The published model states 2.3 µm; on a machine that it describes exactly nothing of that is left, which is said.
+    [said] = [one for one in found["warnings"] if one.startswith("The model states 2.30 µm")]
+    shown_um = float(said.partition("these data show ")[2].split()[0])
+    assert 0.0 < shown_um < 0.3
+    assert "deviation_contradicted" in found["warning_codes"]
+    # What the data do not contradict is not remarked on. A model that no file holds is written as usual.
+    model = dataclasses.replace(load_model("quill"), y_std_um=shown_um)
+    again = tc.diagnose(model, path)
+    assert "deviation_contradicted" not in again.to_dict()["warning_codes"]
+    again.save(tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_text(encoding="utf-8") == dump_model(model)
 
 
 def test_a_reversed_y_is_no_effect_of_the_machine(tmp_path, capsys):
@@ -106,6 +116,11 @@ def test_a_reversed_y_is_no_effect_of_the_machine(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "unexplained" and "path_reversed" in found["warning_codes"]
     assert load_model(out / "model.toml").effects == ()
+    # What model.toml has not is not deployable, and the errors after are those of model.toml.
+    assert found["effects"] and not any(effect["deployable"] for effect in found["effects"])
+    assert all("Not deployed: a path would act the other way round." in one["explanation"] for one in found["effects"])
+    assert found["after"] == found["before"] and found["refused"]["rms_um"] < 0.7 * found["before"]["rms_um"]
+    assert found["refused"]["why"] == "a path would act the other way round"
 
 
 def test_data_without_y_is_refused(tmp_path, capsys):

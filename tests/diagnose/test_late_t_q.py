@@ -192,7 +192,7 @@ def test_a_correction_that_does_harm_is_left_out_and_what_stands_beside_it_is_de
     gain, delay = found.effects
     assert [gain.place, delay.place] == [("gain", "DTF", ""), PLACE]
     assert [effect.kind for effect in found.model.effects] == ["gain"]
-    assert found.deploys(gain) and not found.deploys(delay)
+    assert gain.deployable and not delay.deployable
     assert "T_Q is used as it is" in delay.explanation and "can correct this" not in delay.explanation
     assert gain.named["change"] == pytest.approx(-0.2, abs=4.0 * gain.std["change"])
     # Known with the future it explains all that is left: that is stated, and looked for no further.

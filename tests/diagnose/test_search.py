@@ -204,6 +204,8 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
+    assert not any(effect.deployable for effect in bad.effects) and bad.after == bad.before
+    assert bad.refused.why == "held-out blocks contradict what was found" and bad.found.rms_um > bad.before.rms_um
     assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
     # The same where its own data contradict what would be deployed, in free run.
     times = 0.1
@@ -211,6 +213,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and tone_of(figures(bad)) == "warn"
     assert not bad.model.effects and "worse_in_free_run" in [warning.code for warning in bad.warnings]
+    assert not any(effect.deployable for effect in bad.effects) and bad.after == bad.before
     assert "in free run over the same data" in verdict(figures(bad))
 
 

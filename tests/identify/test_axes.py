@@ -36,6 +36,11 @@ def test_axes_share_the_time_constants_that_the_data_permit_and_no_others(found)
         assert found[axis].params["dtf_gain_um_per_k"] == pytest.approx(gain, rel=0.03)
 
 
+def test_parameters_and_their_errors_are_there_by_axis_as_the_models_are(found):
+    assert list(found.params) == list(found.std_errors) == list(found.model)
+    assert found.params["z"] == found["z"].params and found.std_errors["z"] == found["z"].std_errors
+
+
 def test_axes_with_common_time_constants_have_the_order_that_the_data_permit():
     found = tc.identify(machine(axes=("y", "z")))
     assert found.shared == (("y", "z"),)

@@ -55,6 +55,16 @@ def test_the_published_model_survives():
     assert read_back(model) == model
 
 
+def test_a_model_as_it_was_read_is_written_as_its_own_file(tmp_path):
+    own = tmp_path / "own.toml"
+    own.write_bytes(b"# of the old machine\r\n" + dump_model(direct_model()).encode())
+    model, copy = load_model(own), tmp_path / "copy.toml"
+    assert write_model(copy, model).sha256 == model.sha256 and copy.read_bytes() == own.read_bytes()
+    # What was changed since is another model.
+    changed = dataclasses.replace(model, y_std_um=0.7)
+    assert write_model(copy, changed).y_std_um == 0.7 and copy.read_text() == dump_model(changed)
+
+
 def test_sampled_paths_keep_every_bit_and_their_covariance():
     assert read_back(direct_model()) == direct_model()
 

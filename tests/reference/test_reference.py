@@ -17,7 +17,7 @@ from tests.reference import kept
 EXPECTED: dict[str, Any] = json.loads((kept.KEPT / "expected.json").read_text(encoding="utf-8"))
 #: Relative: of what follows from the numbers alone, and of what is fitted.
 SAME, FITTED = 1e-9, 1e-6
-#: Rows of `simulate` are rounded to so much.
+#: Rows of `simulate` were rounded to so much.
 ROUNDED = 2e-9
 #: Version 0.1.0 named a delay of half a minute in a recording with nothing in it: 0.27 µm rms instead of 0.30.
 NOTHING_IN_IT = "recording"

@@ -18,7 +18,7 @@ from compensator.data.measurement import read
 from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
+from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Refused, Remainder, Step, rms_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
 from compensator.display import text_of_all
@@ -248,12 +248,12 @@ def test_the_residual_of_the_base_model_is_drawn_as_the_data_have_it(found: Diag
     between = filled[used] - effects.y[np.isfinite(effects.y)][used]
     assert between == pytest.approx((with_it.residual_after + wave)[used])
     # Neither a remainder nor effects that the extended model has not are drawn as if it had.
-    idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False), model=QUILL)
+    idle = refused(dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False)))
     assert [line.name for line in lines(idle)] == [
         "residual of the base model",
         ("effect" if len(found.effects) == 1 else "all effects") + " (not in the extended model)",
     ]
-    instead = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, instead=True), model=QUILL)
+    instead = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, instead=True))
     assert lines(instead)[2].name == "remainder, in place of the effects"
     assert lines(instead)[2].y[used] == pytest.approx((lines(instead)[1].y + wave)[used])
 
@@ -285,10 +285,23 @@ def drawn_term(kind: str) -> Any:
 def test_an_effect_that_was_not_deployed_does_not_claim_it(found: Diagnosis) -> None:
     assert len(found.model.effects) == sum(effect.deployable for effect in found.effects) > 0
     assert text(found).count("Deployed in the extended model.") == len(found.model.effects)
-    assert "Not deployed: the model was left unchanged." not in text(found)
-    unchanged = dataclasses.replace(found, model=QUILL)
-    assert "Deployed in the extended model." not in text(unchanged)
-    assert "Not deployed: the model was left unchanged." in text(unchanged)
+    assert "The model was left unchanged." not in text(found)
+    assert "Deployed in the extended model." not in text(refused(found))
+    assert "Not deployed: it is a test." in text(refused(found))
+    assert "The model was left unchanged." in text(refused(found))
+    assert "with what is not deployed" in text(refused(found)) and "(not deployed)" in text(refused(found))
+
+
+def refused(found: Diagnosis) -> Diagnosis:
+    """The same diagnosis where nothing is deployed."""
+    why = "it is a test"
+    return dataclasses.replace(
+        found,
+        model=QUILL,
+        effects=tuple(dataclasses.replace(effect, refused=why) for effect in found.effects),
+        held_out_after=found.held_out_before,
+        refused=Refused(why=why, held_out=found.held_out_after),
+    )
 
 
 # ---------------------------------------------------------------------------- time axis
