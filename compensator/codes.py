@@ -521,7 +521,7 @@ class ModelWarning(Code):
     )
     DEVIATION_CONTRADICTED = (
         "deviation_contradicted",
-        "The data contradict the standard deviation that the model states of its own error.",
+        "The model states a smaller standard deviation of its own error than the data show.",
         "Find out what differs from the calibration; a new calibration states the deviation of its own data.",
     )
 

@@ -387,8 +387,8 @@ def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundE
 
 
 def _deviation_contradicted(stated_um: float, shown_um: float) -> Iterator[Remark]:
-    """Yield a remark where the data contradict the deviation that a model states to which nothing is added."""
-    if shown_um > VERDICT_TIMES * stated_um or stated_um > VERDICT_TIMES * shown_um:
+    """Yield a remark where a model to which nothing is added states a smaller deviation than the data show."""
+    if shown_um > VERDICT_TIMES * stated_um:
         text = (
             f"The model states {stated_um:.2f} µm as the standard deviation of its own error; these data show "
             f"{shown_um:.2f} µm. It was left as it is."

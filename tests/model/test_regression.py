@@ -470,10 +470,10 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         effects = warnings = ()
         held_out = "blocks"
         noise_floor_um = 0.3
-        before = after = page.Scores(fit_pct=1.0, rms_um=2.0, peak_to_peak_um=3.0)
+        before = after = found = page.Scores(fit_pct=1.0, rms_um=2.0, peak_to_peak_um=3.0)
         remainder: Remainder | None = None
         ceiling: Ceiling | None = None
-        advice = could_hide = None
+        advice = could_hide = refused = None
         model = SimpleNamespace(channels=())
         evidence = SimpleNamespace(model=model)
         residual_before = residual_after = np.full(3, 2.0)
