@@ -181,6 +181,7 @@ def test_newer_parameters_of_the_present_effects_show_no_level():
         ([], [], False, 3.9, 0.0),  # a path of the heat
         (["spindle_rpm"], ["fan_rpm"], False, 3.9, None),  # it turned at the zero
         (["spindle_rpm"], None, False, 3.9, None),  # a zero on a warm machine
+        (["spindle_rpm"], ["spindle_rpm"], False, 1.9, 6.0),  # its own misfit, at the level that measured Y shows
         (None, ["spindle_rpm"], False, 3.9, None),
     ],
 )
@@ -190,7 +191,10 @@ def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
     verdict = msgspec.structs.replace(NO_VERDICT, present_rms_um=4.0, candidate_rms_um=rms_um, measured_by="sensor")
     place = Place(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
     place.off_at_zero = off_at_zero
-    found = Compared(place, settings().loop, 60.0, ErrorBlocks(), y_moved=y_moved, zero_channels=zero_channels)
+    began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
+    place.error = ErrorBlocks(blocks=[(n, 6.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
+    present = ErrorBlocks(blocks=began if level_um else [])
+    found = Compared(place, settings().loop, 60.0, present, y_moved=y_moved, zero_channels=zero_channels)
     assert found.level_um == level_um
 
 

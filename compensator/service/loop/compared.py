@@ -19,6 +19,7 @@ from compensator.service.loop.proof import (
     BETTER_PART,
     LEVEL_PART,
     MOVED_PART,
+    OWN_PART,
     is_better_about_zero,
     is_better_to_go_back_to,
     is_clearly_better,
@@ -228,14 +229,15 @@ class Compared:
         """By how much a candidate's level is raised at its adoption, µm; None if its level is not known.
 
         What adds nothing on a machine at rest has the level of a zero at rest, unless measured Y contradicts it and has
-        not moved by itself.
+        not moved by itself. What little it leaves about that zero is its own misfit, whose level measured Y shows.
         Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
         that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
         which of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right
         level: what follows the mount is better, too.
         """
         verdict, off = self._place.verdict, self._place.off_at_zero
-        if off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels):
+        has_level = off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels)
+        if has_level and not is_better_about_zero(verdict, OWN_PART):
             return 0.0 if is_better_about_zero(verdict, MOVED_PART if self._y_moved else 1.0) else None
         shown_um = self.shown_level_um
         is_probed = verdict.measured_by == "probe"
