@@ -102,9 +102,16 @@ class MachineDays:
         ]
 
     def during_break(self) -> list[Event]:
-        """Return what was adopted or gone back from while the couple was broken, or within two hours after it."""
-        decided = self.decided(LoopAction.ADOPT, LoopAction.BACK)
-        return [event for t_h, event in decided if self.times.break_h <= t_h <= self.times.repaired_h + 2.0]
+        """Return what came from the broken couple.
+
+        It was adopted or gone back to while the couple was broken, or was found then, or within two hours after it.
+        """
+        broken_h, mended_h, found = self.times.break_h, self.times.repaired_h, list[Event]()
+        for t_h, event in self.decided(LoopAction.ADOPT, LoopAction.BACK):
+            began_h = (event.data.get("since_utc_ns", 0) - self.start_ns) / _NS_H
+            if broken_h <= t_h <= mended_h or broken_h <= began_h <= mended_h + 2.0:
+                found.append(event)
+        return found
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for `--json`."""
