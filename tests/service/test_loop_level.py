@@ -196,6 +196,8 @@ def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
     present = ErrorBlocks(blocks=began if level_um else [])
     found = Compared(place, settings().loop, 60.0, present, y_moved=y_moved, zero_channels=zero_channels)
     assert found.level_um == level_um
+    newer = Compared(place, settings().loop, 60.0, present, y_moved=y_moved, zero_channels=zero_channels, same=True)
+    assert newer.level_um == (0.0 if rms_um <= 0.8 * 4.0 and not y_moved else None)
 
 
 def test_channels_that_read_0_at_a_zero_at_rest_are_known(tmp_path):

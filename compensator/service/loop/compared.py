@@ -236,8 +236,9 @@ class Compared:
         level: what follows the mount is better, too.
         """
         verdict, off = self._place.verdict, self._place.off_at_zero
-        has_level = off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels)
-        if has_level and not is_better_about_zero(verdict, OWN_PART):
+        is_off = off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels)
+        # Newer parameters must be clearly nearer than the present ones, which have that level, too.
+        if is_off and not self._same and not is_better_about_zero(verdict, OWN_PART):
             return 0.0 if is_better_about_zero(verdict, MOVED_PART if self._y_moved else 1.0) else None
         shown_um = self.shown_level_um
         is_probed = verdict.measured_by == "probe"
