@@ -236,12 +236,12 @@ class Compared:
         level: what follows the mount is better, too.
         """
         verdict, off = self._place.verdict, self._place.off_at_zero
+        is_probed = verdict.measured_by == "probe"
         is_off = off is not None and self._zero_channels is not None and set(off) <= set(self._zero_channels)
         # Newer parameters must be clearly nearer than the present ones, which have that level, too.
-        if is_off and not self._same and not is_better_about_zero(verdict, OWN_PART):
+        if is_off and not (is_probed or self._same or is_better_about_zero(verdict, OWN_PART)):
             return 0.0 if is_better_about_zero(verdict, MOVED_PART if self._y_moved else 1.0) else None
         shown_um = self.shown_level_um
-        is_probed = verdict.measured_by == "probe"
         part = BETTER_PART if is_probed else LEVEL_PART
         # What creeps beside probes both models are corrected for, and few values often look like a drift.
         shows_level = is_probed or not self._y_moved
