@@ -104,12 +104,12 @@ class MachineDays:
     def during_break(self) -> list[Event]:
         """Return what came from the broken couple.
 
-        It was adopted or gone back to while the couple was broken, or was found then, or within two hours after it.
+        It was adopted or gone back to while the couple was broken, or within two hours after it and found since it broke.
         """
         broken_h, mended_h, found = self.times.break_h, self.times.repaired_h, list[Event]()
         for t_h, event in self.decided(LoopAction.ADOPT, LoopAction.BACK):
             began_h = (event.data.get("since_utc_ns", 0) - self.start_ns) / _NS_H
-            if broken_h <= t_h <= mended_h or broken_h <= began_h <= mended_h + 2.0:
+            if broken_h <= t_h <= mended_h or broken_h <= began_h <= t_h <= mended_h + 2.0:
                 found.append(event)
         return found
 

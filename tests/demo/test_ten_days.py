@@ -67,7 +67,7 @@ def test_the_page_names_what_happens_and_what_was_decided():
 
 def test_a_change_from_a_broken_couple_is_no_success():
     broken_h = demo.TIMES.break_h
-    for t_h, began_h, count in ((0.5, -9.0, 1), (9.0, 0.5, 1), (2.0, -9.0, 0)):
+    for t_h, began_h, count in ((0.5, -9.0, 1), (2.0, 0.5, 1), (2.0, -9.0, 0), (9.0, 0.5, 0)):
         since_ns = round((broken_h + began_h) * HOUR_NS)
         adopted = made(events=[*made().events, decided(broken_h + t_h, LoopAction.ADOPT, since_utc_ns=since_ns)])
         assert len(adopted.during_break()) == count
