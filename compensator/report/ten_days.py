@@ -104,7 +104,7 @@ class MachineDays:
     def during_break(self) -> list[Event]:
         """Return what came from the broken couple.
 
-        It was adopted or gone back to while the couple was broken, or within two hours after it and found since it broke.
+        It was adopted or gone back to while the couple was broken, or within two hours after it if found since then.
         """
         broken_h, mended_h, found = self.times.break_h, self.times.repaired_h, list[Event]()
         for t_h, event in self.decided(LoopAction.ADOPT, LoopAction.BACK):
