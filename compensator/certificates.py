@@ -97,9 +97,9 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     except ImportError:
         return None
     authorities = _read(source, files.names[0], files.ca, x509.load_pem_x509_certificates)
-    own = _read(source, files.names[1], files.certificate, x509.load_pem_x509_certificates)
+    own = _read(source, files.names[1], files.certificate, _with_known_key)
     key = _read(source, files.names[2], files.key, lambda data: load_pem_private_key(data, None))
-    if _read(source, files.names[1], files.certificate, _public_key) != key.public_key():
+    if own[0].public_key() != key.public_key():
         raise ConfigError(f"{source}: {files.names[2]} = {str(files.key)!r}: not the key of {files.certificate}")
     if len(own) == 1 and not any(_issued(own[0], authority) for authority in authorities):
         raise ConfigError(
@@ -138,10 +138,13 @@ def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Rem
     return [Remark(ServiceWarning.CERTIFICATE_ENDS, figures)]
 
 
-def _public_key(data: bytes) -> Any:
+def _with_known_key(data: bytes) -> Any:
+    """Return certificates; one whose key is of a kind that nobody knows is none."""
     from cryptography import x509
 
-    return x509.load_pem_x509_certificates(data)[0].public_key()
+    found = x509.load_pem_x509_certificates(data)
+    found[0].public_key()
+    return found
 
 
 def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:

@@ -439,6 +439,11 @@ def data_of(event: Event, kind: type[_AnyData]) -> _AnyData | None:
         return None
 
 
+def pause_of(event: Event) -> PauseData | None:
+    """Return the pause that an event records; None if it records none."""
+    return data_of(event, PauseData) if event.kind == EventKind.RESTART else None
+
+
 def command_of(event: Event) -> str:
     """Return the name of the command that an event records.
 

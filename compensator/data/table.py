@@ -306,8 +306,8 @@ def _without_bad(
     """
     for column, marks in arrays.items():
         channel = column.removesuffix(QUALITY)
-        if channel == "heat_w" and "heat_measured_w" in numbers:
-            channel = "heat_measured_w"
+        if channel == "heat_w" and MEASURED_HEAT in numbers:
+            channel = MEASURED_HEAT
         if column == channel or column in numbers or channel not in numbers:
             continue
         words = [str(mark).strip().lower() for mark in marks.tolist()]

@@ -28,7 +28,7 @@ from compensator.clock import NS
 from compensator.codes import ProbeCode
 from compensator.config import Config, parse_config
 from compensator.errors import DataError
-from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
+from compensator.events import CommandName, EventKind, command_of, pause_of
 from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample
 from compensator.messages_axes import AxisOffset, RecordedOffsets, further_values
 from compensator.model.thermal_model import ThermalModel
@@ -342,8 +342,8 @@ class FreeRun:
 
     def _pass_noted_pause(self, step: RecordedStep, seq: int) -> bool:
         """Account for the pause that a start has recorded; return whether there is one."""
-        pauses = ((event, data_of(event, PauseData)) for event in step.events if event.kind == EventKind.RESTART)
-        for event, pause in pauses:
+        for event in step.events:
+            pause = pause_of(event)
             if pause is None:
                 continue
             # Recorded with the first sample of that start; samples that a full disk never accepted are added.

@@ -11,7 +11,7 @@ from msgspec import UNSET, UnsetType
 
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
-from compensator.events import EventKind, PauseData, data_of
+from compensator.events import EventKind, pause_of
 from compensator.messages import (
     SCHEMA,
     UNREADABLE,
@@ -213,7 +213,7 @@ class WatchedMachine:
             self.events.append(message)
             if message.kind == EventKind.START:
                 self.numbers.started(message.time_utc_ns)
-            pause = data_of(message, PauseData) if message.kind == EventKind.RESTART else None
+            pause = pause_of(message)
             if pause is not None and pause.missing is not None:
                 self.numbers.stood_still(pause.missing)
             return True

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from compensator import __version__
 from compensator.clock import Clock
-from compensator.events import EventKind, PauseData, data_of
+from compensator.events import EventKind, pause_of
 from compensator.messages import shipped_schema
 from compensator.messages_axes import ALL_MESSAGES, axis_of
 from compensator.recording.compaction import rewrite
@@ -206,7 +206,7 @@ class ShopRecorder:
         numbers = self._numbers.setdefault(prefix, {})
         if kind in ("sample", "estimate") or axis_of(kind) is not None:
             numbers.setdefault(rest, Sequence()).update(message.seq, message.time_utc_ns)
-        pause = data_of(message, PauseData) if kind == "event" and message.kind == EventKind.RESTART else None
+        pause = pause_of(message) if kind == "event" else None
         if pause is not None and pause.missing is not None:
             for sequence in numbers.values():
                 sequence.stood_still(pause.missing)

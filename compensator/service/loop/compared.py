@@ -169,8 +169,7 @@ class Compared:
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
         if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
             return False
-        own_um = rms_of(np.array([own for _, own, _ in residuals_um]))
-        other_um = rms_of(np.array([other for _, _, other in residuals_um]))
+        own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
         return other_um <= ALONE_PART * own_um and other_um > 0.0
 
     @property

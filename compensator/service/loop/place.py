@@ -67,8 +67,7 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
         # What gave its place too often would never be judged by its own hours.
         is_young = now_ns - before.since_utc_ns < _YOUNG * settings.shadow_h * HOUR_NS
         if before.verdict.measured_by == "probe":
-            own = [one for one in before.comparison.probes if one.time_utc_ns >= before.comparison.model_ns]
-            is_young = is_young or len(own) < _YOUNG * settings.probes
+            is_young = is_young or len(before.comparison.own_probes) < _YOUNG * settings.probes
         return "in_shadow" if is_young or is_asked(before, settings) else ""
     return "waits" if state.exchange else ""
 

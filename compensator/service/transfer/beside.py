@@ -30,7 +30,7 @@ def beside(rival: ComparisonState, other: ComparisonState, *, level_um: float = 
         square = own.squares[1] + own.samples * level_um * (level_um - 2.0 * own.means[1])
         means = (own.means[1] - level_um, block.means[1], block.means[2])
         blocks.append(Block(zero, block.number, min(own.samples, block.samples), (square, block.squares[1]), means))
-    shown = {probe.time_utc_ns: probe.other_um for probe in rival.probes if probe.time_utc_ns >= rival.model_ns}
+    shown = {probe.time_utc_ns: probe.other_um for probe in rival.own_probes}
     probes = [
         ComparedProbe(probe.time_utc_ns, shown[probe.time_utc_ns], probe.other_um)
         for probe in other.probes

@@ -115,6 +115,11 @@ class ComparisonState(msgspec.Struct, kw_only=True):
     y_um: float | None = None
     model_ns: int = 0
 
+    @property
+    def own_probes(self) -> list[ComparedProbe]:
+        """The probes since the other model has been compared itself."""
+        return [probe for probe in self.probes if probe.time_utc_ns >= self.model_ns]
+
     def move_clock(self, by_ns: int) -> None:
         """Move all times, as the clock was set."""
         by = round(by_ns / BLOCK_NS)
@@ -233,8 +238,8 @@ class Comparison:
         """Return what was compared since the other model has been, without the one before it."""
         state = self.state
         blocks = [block for block in state.blocks if block.number * BLOCK_NS >= state.model_ns]
-        probes = [probe for probe in state.probes if probe.time_utc_ns >= state.model_ns]
-        own = msgspec.structs.replace(state, blocks=blocks, probes=probes, first_ns=max(state.first_ns, state.model_ns))
+        first_ns = max(state.first_ns, state.model_ns)
+        own = msgspec.structs.replace(state, blocks=blocks, probes=state.own_probes, first_ns=first_ns)
         return Comparison(self._period_s, own, axis=self._axis)
 
     def is_itself_better(self) -> bool:
