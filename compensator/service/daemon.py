@@ -22,7 +22,7 @@ from compensator.axes import FIRST, label_of
 from compensator.clock import NS, Clock
 from compensator.config import Config
 from compensator.events import EventKind, Note, PauseData
-from compensator.messages import SCHEMA, Offset, Sample, Status, encode
+from compensator.messages import SCHEMA, Offset, Probe, Sample, Status, encode
 from compensator.messages_axes import AxesStatus, AxisOffset, AxisState
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
@@ -141,8 +141,9 @@ class Daemon:
             unproven=config.zenoh.accepts_unproven(),
             loop=self._loop,
         )
-        #: Probes of the sample that is being processed.
+        #: Probes of the sample that is being processed, and those that cannot be read.
         self._deciding: list[ReceivedProbe] = []
+        self._unread: list[Probe] = []
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -152,8 +153,8 @@ class Daemon:
         self._pending: asyncio.Task[None] | None = None
         self._earlier = notes
         self._first = True
-        #: Samples since the last one that are not on record: all, and those that the model has followed all the same.
-        self._missing, self._followed = 0, 0
+        #: Samples since the last one that are not on record.
+        self._missing = 0
         #: Whether the file so far cannot reproduce the state before the next sample: processing failed, or a pause.
         self._needs_file = False
         #: Seconds from the last byte read to the offset published, of the newest samples.
@@ -237,10 +238,14 @@ class Daemon:
                 await self._sample(label_ns)
         except Exception as error:
             log.exception("internal error")
-            self._events.note(EventKind.ERROR, f"internal error: {type(error).__name__}: {error}")
-            self._compensation.fail()
+            self._fail(error)
             if label_ns is not None:
                 await self._hold(label_ns)
+
+    def _fail(self, error: Exception) -> None:
+        """Report an error; the offset is held from the next one on."""
+        self._events.note(EventKind.ERROR, f"internal error: {type(error).__name__}: {error}")
+        self._compensation.fail()
 
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset is held, without the sample that could not be processed."""
@@ -248,19 +253,19 @@ class Daemon:
         self._sampler.close_sample()  # its readings belong to no later sample
         machine, sequence = self._config.machine.name, self._events.sequence
         held, *further = self._compensation.held_axes(machine, sequence, label_ns)
-        probes, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []
+        undecided, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []
+        unread, self._unread = self._unread, []
         offsets = await self._journal.record(
             label_ns,
             self._compensation.state(),
             opening=self._opening(),
-            probes=probes,
+            probes=[*(replace_fields(probe, seq=sequence) for probe in unread), *undecided],
             offset=held,
             further=[one for one in further if isinstance(one, AxisOffset)],
         )
         for topic, offset in offsets.items():
             self._publish(topic, encode(offset))
         self._missing += 1
-        self._followed += self._compensation.status.seq == sequence
         self._events.sequence += 1
 
     @property
@@ -304,10 +309,10 @@ class Daemon:
         """Process a sample and publish it once it is on disk; polling continues if this takes long."""
         await self._await_pending()
         began = time.perf_counter()
-        self._pass_pause(label_ns)
         self._compensation = self._adoption.swap()
         if self._loop is not None:
             self._compensation = self._loop.before_sample(self._compensation)
+        self._pass_pause(label_ns)  # for all models: those that are new stand before it, too
         state, opening, needs_file = self._compensation.frozen(), self._opening(), self._needs_file
         self._needs_file = True
         self._commands.apply(self._compensation)
@@ -321,7 +326,7 @@ class Daemon:
             period_s=self._compensation.model.period_s,
             channels=self._sampler.close_sample(),
         )
-        self._deciding, unread = self._commands.drain_probes()
+        self._deciding, self._unread = self._commands.drain_probes()
         self._compensation.receive_probes(self._deciding)
         outcome = self._compensation.process(raw)
         self._needs_file, self._deciding = False, []
@@ -333,7 +338,8 @@ class Daemon:
         expected = self._journal.expected
         self._note_state(expected(outcome.offset), [expected(one) for one in outcome.further])
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
-        probes = [*(replace_fields(probe, seq=raw.seq) for probe in unread), *outcome.probes]
+        probes = [*(replace_fields(probe, seq=raw.seq) for probe in self._unread), *outcome.probes]
+        self._unread = []
         entry = self._journal.enqueue(
             label_ns,
             state,
@@ -362,54 +368,65 @@ class Daemon:
             await pending
 
     def _publish_sample(self, decided: _Decided) -> None:
-        """Publish a sample, the offset first."""
+        """Publish a sample, the offset first.
+
+        It is on record: a defect must publish nothing else with its number.
+        """
         entry = decided.entry
-        offset = self._journal.resolve(entry)
-        assert offset is not None
-        published = entry.offsets()
-        further = tuple(one for one in published.values() if isinstance(one, AxisOffset) and one.axis != FIRST)
-        outcome = replace_fields(decided.outcome, offset=offset, further=further)
-        self._note_state(offset, further)
-        for topic, message in published.items():
-            self._publish(topic, encode(message))
+        try:
+            offsets = self._journal.resolve(entry)
+            offset = offsets["offset"]
+            further = tuple(one for one in offsets.values() if isinstance(one, AxisOffset) and one.axis != FIRST)
+            self._note_state(offset, further)
+            for topic, message in offsets.items():
+                self._publish(topic, encode(message))
+        except Exception as error:
+            log.exception("internal error")
+            self._events.sequence += 1
+            self._fail(error)
+            return
         self.latency_s.append(time.perf_counter() - decided.began)
-        self._publish("sample", entry.sample)
-        self._publish("estimate", entry.estimate)
-        self._publish("status", encode(self._status(outcome)))
         self._events.sequence += 1
+        outcome = replace_fields(decided.outcome, offset=offset, further=further)
         self._adoption.follow(outcome)
-        if self._loop is not None:
-            self._loop.after_sample(outcome)
         self._unreported.append(outcome)
+        try:
+            self._publish("sample", entry.sample)
+            self._publish("estimate", entry.estimate)
+            self._publish("status", encode(self._status(outcome)))
+            if self._loop is not None:
+                self._loop.after_sample(outcome)
+        except Exception:
+            log.exception("internal error after the offset was published")
 
     def _opening(self) -> Mapping[str, bytes]:
         """Return what a recording begins with beside the state of the compensation."""
         return self._loop.opening() if self._loop is not None else {}
 
-    def _pause(self, samples: int | None, followed: int = 0) -> None:
-        self._compensation.pause(None if samples is None else samples - followed)
+    def _pause(self, samples: int | None, missed: int | None) -> None:
+        """Let time pass: for the models in shadow, and for the present one, which may have followed some samples."""
+        self._compensation.pause(missed)
         if self._loop is not None:
             self._loop.pause(samples)
 
     def _pass_pause(self, label_ns: int) -> None:
         """Account for the time without measurements before a sample."""
         first, self._first = self._first, False
-        missing, followed = self._missing, self._followed
-        self._missing, self._followed = 0, 0
+        missing, self._missing = self._missing, 0
         last_ns, period_s = self._compensation.status.time_utc_ns, self._compensation.model.period_s
         if last_ns == 0 or not (first or missing):
             return
         if not first:
             self._needs_file = True
-            self._pause(missing, followed)
+            self._pause(missing, min(missing, self._events.sequence - self._compensation.status.seq - 1))
             self._note_pause(f"{missing} sample(s) are missing since the last one", missing)
         elif label_ns <= last_ns:
-            self._pause(None)
+            self._pause(None, None)
             text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
             self._note_pause(text, None)
         else:
             missing = max(round((label_ns - last_ns) / (period_s * NS)) - 1, 0)
-            self._pause(missing)
+            self._pause(missing, missing)
             self._note_pause(f"{missing} sample(s) are missing between the last recording and now", missing)
 
     def _note_pause(self, text: str, missing: int | None) -> None:

@@ -121,11 +121,11 @@ class Journal:
         """Wait longer while polling continues."""
         await self._clock.settle([entry.attempt], self._patience_s)
 
-    def resolve(self, entry: Entry) -> Offset | None:
-        """Return the offset to be published now.
+    def resolve(self, entry: Entry) -> dict[str, Offset]:
+        """Return the offset of each axis to be published now, by name.
 
-        If the disk has not accepted it yet, or refused it, the offset carries the reason; the sample waits and is
-        written in its order.
+        If the disk has not accepted them yet, or refused them, they carry the reason; the sample waits and is written
+        in its order.
         """
         in_flight = self._writer.release(entry)
         self._note_disk(entry.reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
@@ -136,7 +136,7 @@ class Journal:
         elif self._checkpoint is not None and entry.offset is not None:
             named = [one for one in (*entry.further, entry.offset) if isinstance(one, AxisOffset)]
             self._checkpoint.write(entry.offset, further_values(named))
-        return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
+        return entry.offsets()
 
     async def record(
         self,
@@ -157,8 +157,7 @@ class Journal:
         """
         entry = self.enqueue(time_utc_ns, state, opening=opening, probes=probes, offset=offset, further=further)
         await self.wait_briefly(entry)
-        self.resolve(entry)
-        return entry.offsets()
+        return self.resolve(entry)
 
     def expected(self, offset: AnyOffset) -> AnyOffset:
         """Return the offset as it will be published if the disk behaves as with the previous sample."""

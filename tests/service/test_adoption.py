@@ -17,10 +17,11 @@ import pytest
 from compensator.errors import ServiceError
 from compensator.messages import number
 from compensator.recording.reading import recordings
-from compensator.service.compensation import Outcome
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import adoption
 from compensator.service.transfer.adoption import Adoption
+from compensator.service.transfer.candidate import ModelCandidate
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
@@ -229,6 +230,54 @@ async def test_too_little_on_record_is_refused_and_taken_only_by_force(tmp_path:
     assert number(new[0].offset.y_offset_std_um) > 1.5 * number(before.offset.y_offset_std_um)
     assert new[0].estimate.t_q_ref_degc == before.estimate.t_q_ref_degc
     assert largest_step(machine.outcomes) <= 2.0 + 1e-9
+
+
+async def test_a_model_that_fails_as_it_takes_over_is_not_found_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(tmp_path, SLOW)
+    machine.at_sample[60] = Asked(machine, "adopt", payload(STRONGER, force=True))
+
+    def broken(*_: Any) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(ModelCandidate, "update", broken)
+    await machine.run(90)
+    assert {outcome.offset.model_sha256 for outcome in machine.outcomes} == {sha256_of(QUILL)}
+    assert {outcome.offset.state for outcome in machine.outcomes} <= {"ok", "degraded"}
+    assert machine.store.in_use() == QUILL
+    (event,) = machine.events("adopt")
+    assert event.data["ok"] is False and "ZeroDivisionError: a defect; model quill goes on" in event.text
+    assert check_files(machine) == 90
+
+
+@pytest.mark.parametrize("minutes", [10.0, 40.0])
+async def test_a_pause_before_it_takes_over_passes_for_it_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, minutes: float
+) -> None:
+    """The service stands still after the model is prepared: it must not go on from before that."""
+    machine = Machine(tmp_path / "adopting", SLOW)
+    machine.at_sample[200] = Asked(machine, "adopt", payload(STRONGER))
+    swap, stood = Adoption.swap, [0]
+
+    def delayed(adoption: Adoption) -> Compensation:
+        if not stood[0] and adoption.is_under_way and adoption._order.ready is not None:  # type: ignore[union-attr]
+            stood[0] = len(machine.outcomes) + 1
+            machine.at_sample[stood[0]] = lambda: machine.clock.stand_still(60.0 * minutes)
+            return adoption._running()
+        return swap(adoption)
+
+    monkeypatch.setattr(Adoption, "swap", delayed)
+    await machine.run(500, adopted(STRONGER, then=20))
+    monkeypatch.undo()
+    always = Machine(tmp_path / "always", SLOW, STRONGER)
+    always.at_sample[stood[0]] = lambda: always.clock.stand_still(60.0 * minutes)
+    await always.run(len(machine.outcomes))
+    whole = always.by_time()
+    new = [one for one in machine.outcomes if one.offset.model_sha256 == sha256_of(STRONGER)]
+    assert len(new) == 21
+    assert [one.estimate for one in new] == [whole[one.offset.time_utc_ns].estimate for one in new]
+    assert check_files(machine) == len(machine.outcomes)
 
 
 async def test_back_and_further_back_to_the_configured_one(tmp_path: Path) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from compensator.service.loop import found
+from compensator.service.disk_writer import Entry
+from compensator.service.journal import Journal
+from compensator.service.loop import found, live
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Shadow
-from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.model_store import ModelStore, sha256_of
 from tests.service.living import MACHINE
 from tests.service.looping import extended, shown, stronger
 from tests.service.test_loop_service import EVENING, Asked, Looping, checked
@@ -105,6 +108,38 @@ async def test_at_an_operators_answer(tmp_path: Path, monkeypatch: pytest.Monkey
     await machine.run(EVENING + 120)
     assert broken.calls and "a defect" in said(machine)
     unharmed(machine, EVENING + 120)
+
+
+@pytest.mark.parametrize("disk_is_slow", [False, True])
+async def test_after_a_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk_is_slow: bool) -> None:
+    """What is told about the loop, and what begins then: the offset is published already."""
+    machine = Looping(tmp_path, shown(extended()))
+    machine.at_sample[EVENING + 60] = lambda: Breaks(monkeypatch, live, "loop_status")
+    if disk_is_slow:
+        brief = Journal.wait_briefly
+
+        async def late(journal: Journal, entry: Entry) -> bool:
+            return await brief(journal, entry) and len(machine.outcomes) != EVENING + 60
+
+        monkeypatch.setattr(Journal, "wait_briefly", late)
+    await machine.run(EVENING + 120)
+    assert "a defect" in said(machine)
+    unharmed(machine, EVENING + 120)
+    numbers = [json.loads(data)["seq"] for topic, data in machine.published if topic == "offset"]
+    assert len(set(numbers)) == len(numbers) == EVENING + 120
+    checked(machine)
+
+
+async def test_a_model_that_cannot_be_stored_is_not_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does it keep the loop, or a person, waiting for it."""
+    machine = Looping(tmp_path, shown(extended()))
+    broken = Breaks(monkeypatch, ModelStore, "adopt", always=True)
+    await machine.run(960, until=lambda _: bool(broken.calls))
+    loop = machine.daemon._loop  # type: ignore[union-attr]
+    await machine.run(60)
+    assert not loop.is_working and not loop.is_exchanging  # type: ignore[union-attr]
+    assert ("end", "failed") in machine.steps()
+    unharmed(machine, len(machine.outcomes))
 
 
 async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,8 @@ from compensator.config import Config, parse_config
 from compensator.errors import ConfigError
 from compensator.events import EventKind
 from compensator.messages import ProbeRequest, Sample, number
+from compensator.model.model_file import parse_model
+from compensator.service.loop.core import warmed_on
 from compensator.service.loop.record import usable_table
 from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
 from compensator.service.loop.trust import is_alarmed
@@ -275,6 +277,21 @@ def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
     again.restore(loop.state())
     steps = run(again, source, 3)
     assert len(night.asked) == 2 and steps[-1].candidates
+
+
+def test_a_candidate_that_is_new_passes_a_pause_too() -> None:
+    """The diagnosis has ended with the last sample before it."""
+    loop, samples = LoopRun(settings(), QUILL, Night(shown(extended()))), machine(NIGHT + 120)
+    steps = [loop.process(sample) for sample in itertools.islice(samples, NIGHT - 30)]
+    while ("diagnose", "planned") not in [found[1:] for found in decisions(steps)]:
+        steps.append(loop.process(next(samples)))
+    loop.pause(30)
+    sample = next(itertools.islice(samples, 30, None))
+    (candidate,) = loop.process(sample).candidates
+    model = parse_model(extended(), source="candidate")
+    always = warmed_on(settings(), model, [step.outcome for step in steps])
+    always.pause(30)
+    assert candidate.y_pred_um == always.process(sample).estimate.y_pred_um
 
 
 def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:

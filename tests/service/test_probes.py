@@ -413,7 +413,7 @@ async def test_a_lost_temperature_makes_a_probe_weigh_less(tmp_path: Path) -> No
 
 
 async def test_a_probe_of_a_sample_that_failed_is_recorded_as_undecided(tmp_path: Path, monkeypatch: Any) -> None:
-    """And the next one is taken once an operator has looked."""
+    """So is one that was refused before it, and the next one is taken once an operator has looked."""
     machine, process, defects = ProbedMachine(tmp_path), Compensation.process, [ZeroDivisionError("a defect")]
 
     def fail_once(compensation: Compensation, raw: Any) -> Any:
@@ -421,12 +421,16 @@ async def test_a_probe_of_a_sample_that_failed_is_recorded_as_undecided(tmp_path
             raise defects.pop()
         return process(compensation, raw)
 
+    def probe_and_rubbish() -> None:
+        machine.command("probe", b"rubbish")
+        machine.probe()
+
     monkeypatch.setattr(Compensation, "process", fail_once)
-    machine.at_sample[60] = machine.probe
+    machine.at_sample[60] = probe_and_rubbish
     machine.at_sample[61] = lambda: machine.command("resume")
     machine.at_sample[65] = machine.probe
     await machine.run(80)
-    assert not defects and machine.codes() == ["internal_error", "taken"]
+    assert not defects and machine.codes() == [ProbeCode.MALFORMED, "internal_error", "taken"]
     assert look(machine).clean
 
 

@@ -199,3 +199,25 @@ async def test_times_of_the_loop_are_those_of_before(tmp_path: Path) -> None:
     for shadow in machine.daemon._loop._core.shadows.values():  # type: ignore[union-attr]
         assert shadow.compensation.status.seq == machine.outcomes[-1].sample.seq
     checked(machine)
+
+
+async def test_a_model_that_begins_in_shadow_after_it_has_passed_it(tmp_path: Path) -> None:
+    """Its warm-up ended before the service stood still, and it begins with the first sample after that."""
+    machine = Looping(tmp_path, shown(extended()))
+    stood: list[int] = []
+
+    def at_poll() -> None:
+        has_next = machine.daemon._loop._core.state.has_next  # type: ignore[union-attr]
+        if has_next and not stood and machine.clock.utc_ns() % (60 * NS) == 0:
+            stood.append(len(machine.outcomes))
+            machine.clock.stand_still(1800.0)
+
+    machine.at_poll = at_poll
+    await machine.run(EVENING + 20)
+    first = machine.candidates()[0]
+    (present,) = [one.estimate for one in machine.outcomes if one.sample.seq == first.seq]
+    assert stood and first.seq - machine.outcomes[stood[0] - 1].sample.seq >= 30
+    # The effect of `extended` is a part of the gain: both are as far from what they were half an hour before.
+    assert first.y_std_um == pytest.approx(present.y_std_um, rel=0.2)
+    assert number(first.y_pred_um) == pytest.approx(number(present.y_pred_um), rel=0.15)
+    checked(machine)

@@ -328,24 +328,24 @@ class LiveLoop:
 
     def after_sample(self, outcome: Outcome) -> None:
         """Begin what was decided with a sample that is published."""
-        core = self._core
         if self._warming is not None:
             self._warming.since.append(outcome)
         storing = self._storing
         if storing.is_done and not (storing.is_working or self.is_exchanging):
             # An exchange that a defect has ended: the next start must find the model that goes on.
             storing.begin_again(self._model, model_of(self._config, self._model, source="present model").name)
-        if core is None:
-            return
-        wanted = core.loop.wanted
-        if wanted is not None and self._task is None and self._found is None:
+        self._guarded(self._begin_decided, None)
+
+    def _begin_decided(self, core: ModelLoop) -> None:
+        """Begin a diagnosis that is wanted, and to store the model of a decided exchange."""
+        if core.loop.wanted is not None and self._task is None and self._found is None:
             self._task = asyncio.create_task(self._make_diagnosis(core))
-        if core.state.exchange and not (storing.is_working or storing.is_done):
-            storing.begin(core)
+        if core.state.exchange and not (self._storing.is_working or self._storing.is_done):
+            self._storing.begin(core)
 
     def status(self) -> LoopStatus | None:
         """Return how the loop is, for `thermal/status`; None if it is off."""
-        return loop_status(self._core, self._candidates) if self._core is not None else None
+        return self._guarded(lambda core: loop_status(core, self._candidates), None)
 
     async def end(self) -> None:
         """End what is in progress: a diagnosis is begun again at the next start, a stored model is used then."""

@@ -131,6 +131,8 @@ class LoopRun:
 
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured, as after a restart; see `Compensation.pause`."""
+        # What follows from the last sample comes first: a model that is new stands before the pause, too.
+        self._notes = self._between(self._compensation.status.time_utc_ns)
         self._compensation.pause(samples)
         self._core.pause(samples)
 

@@ -90,8 +90,14 @@ class Storing:
             await asyncio.to_thread(store)
             self.is_done = not again
         except ServiceError as error:
-            if again:
-                log.error("the next start uses another model: %s", error)
-            else:
-                self.refused = str(error)
+            self._refuse(str(error), again=again)
+        except Exception as error:
+            log.exception("internal error while a model is stored")
+            self._refuse(f"the model is not stored: internal error: {type(error).__name__}: {error}", again=again)
         self._task = None
+
+    def _refuse(self, why: str, *, again: bool) -> None:
+        if again:
+            log.error("the next start uses another model: %s", why)
+        else:
+            self.refused = why

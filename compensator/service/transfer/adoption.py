@@ -193,12 +193,16 @@ class Adoption:
             return old
         self._order = None
         candidate, comparison = order.ready.candidate, order.ready.comparison
-        for outcome in order.since:
-            candidate.update(outcome)
-        new = candidate.compensation
-        before = old.status
+        new, before = candidate.compensation, old.status
         has_offset = not math.isnan(before.target_um)
-        new.continue_from(msgspec.structs.replace(before.handover, model_changed=has_offset))
+        try:
+            for outcome in order.since:
+                candidate.update(outcome)
+            new.continue_from(msgspec.structs.replace(before.handover, model_changed=has_offset))
+        except Exception as error:
+            log.exception("internal error of a model that is adopted")
+            self._take_back(order, old.model, error)
+            return old
         after = new.status
         difference = after.target_um - before.target_um
         self._journal.start_new_file(order.ready.data)
@@ -222,6 +226,17 @@ class Adoption:
             },
         )
         return new
+
+    def _take_back(self, order: _Order, present: ThermalModel, error: Exception) -> None:
+        """Go on with the present model, now and at the next start: the new one failed after the command's answer."""
+        text = f"refused: internal error: {type(error).__name__}: {error}; model {present.name} goes on"
+        try:
+            assert self._store is not None
+            data = self._store.file_of(present.sha256)
+            self._store.adopt(data, name=present.name, time_utc_ns=self._clock.utc_ns())
+        except ServiceError as not_stored:
+            text += f"; the next start uses the other one: {not_stored}"
+        self._events.note(EventKind.ADOPT, text, {"ok": False, "action": order.action})
 
     async def end(self) -> None:
         """Wait briefly until a command in progress is answered, then refuse it: the service must end.

@@ -97,6 +97,10 @@ class ModelStore:
         in_use = self._read().in_use
         return bool(in_use) and sha256 == (in_use[-2].sha256 if len(in_use) > 1 else self._configured_sha256)
 
+    def file_of(self, sha256: str) -> bytes:
+        """Return the file of a model that is or was in use."""
+        return self.configured if sha256 == self._configured_sha256 else self.load(sha256)
+
     def load(self, sha256: str) -> bytes:
         """Return a model file of the store."""
         if re.fullmatch("[0-9a-f]{64}", sha256) is None:
