@@ -21,11 +21,12 @@ from compensator.diagnose.change import changed_at
 from compensator.diagnose.deployment import SHORT_H
 from compensator.diagnose.onset import WELL_EXPLAINED, left_part
 from compensator.errors import CompensatorError, DataError
+from compensator.model.effects.names import name_of
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import is_probed, usable_table
-from compensator.service.loop.weighing import Diagnosed, name_of
+from compensator.service.loop.weighing import Diagnosed
 from compensator.service.outcome import Outcome
 
 #: Effects by which measured Y moves by itself: it goes on, or happened once.

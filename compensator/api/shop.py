@@ -28,7 +28,7 @@ from compensator.service.loop.state import same_effects
 from compensator.service.probing import ReceivedProbe
 from compensator.service.replay import RecordedStep, execute, setup_of, steps_in
 from compensator.service.status import Zero
-from compensator.service.transfer.candidate import RecordedRun
+from compensator.service.transfer.warm_up import RecordedRun
 
 Policy = Literal["propose", "adopt"]
 #: Over how long before the end of the recordings an error is that of now, h.

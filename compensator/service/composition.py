@@ -18,7 +18,7 @@ from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.loading import Setup
 from compensator.service.loop.live import LoopParts
-from compensator.service.loop.process import Diagnose, DiagnosisProcess
+from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.resuming import resume_loop
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.presence import sole_user
@@ -45,13 +45,13 @@ async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | Driv
     return answers
 
 
-def loop_parts(setup: Setup, resumed: Resumed, diagnose: Diagnose | None = None) -> LoopParts | None:
+def loop_parts(setup: Setup, resumed: Resumed) -> LoopParts | None:
     """Return the parts of the loop, which continues from the last recording; None without `[loop]`."""
     core = resume_loop(setup.loaded, resumed, setup.store)
     if core is None:
         return None
-    made_by = diagnose or DiagnosisProcess(setup.config, setup.recordings, setup.store.folder / "diagnoses")
-    return LoopParts(core=core, model=setup.model_bytes, store=setup.store, diagnose=made_by)
+    diagnose = DiagnosisProcess(setup.config, setup.recordings, setup.store.folder / "diagnoses")
+    return LoopParts(core=core, model=setup.model_bytes, store=setup.store, diagnose=diagnose)
 
 
 async def run_service(
@@ -64,7 +64,6 @@ async def run_service(
     on_poll: Callable[[], None] | None = None,
     on_publish: Callable[[str, bytes], None] | None = None,
     publishes: Callable[[], bool] = lambda: True,
-    diagnose: Diagnose | None = None,
 ) -> Daemon:
     """Run the service of a configuration until it is stopped.
 
@@ -84,8 +83,6 @@ async def run_service(
         Called with name and JSON of each message after it was published; an error of it is logged.
     publishes : callable, optional
         Whether messages are published now, or only recorded, as those of a simulated past.
-    diagnose : callable, optional
-        Makes the diagnoses of the loop; by default a process of their own.
     """
     loaded, config, folder = setup.loaded, setup.config, setup.recordings
     machine, clock = config.machine.name, clock or SystemClock()
@@ -128,7 +125,7 @@ async def run_service(
         further_max = {one.name: one.bounds.offset_max_um for one in planned_outputs(config.axis)}
         checkpointed = checkpoint.read(config.limits.offset_max_um, further_max)
         resumed = resume(loaded, setup.model, checkpointed)
-        loop = loop_parts(setup, resumed, diagnose)
+        loop = loop_parts(setup, resumed)
         first = recorder.first_sequence(clock.utc_ns(), setup.model.period_s)
         compensation = resumed.compensation
         # As before on a machine that does not watch for jumps: its recordings stay the same.

@@ -269,11 +269,6 @@ class Daemon:
         self._events.sequence += 1
 
     @property
-    def is_diagnosing(self) -> bool:
-        """Whether a diagnosis, or what follows from it, is in progress beside the samples: simulated time may wait."""
-        return self._loop is not None and self._loop.is_working
-
-    @property
     def unfinished(self) -> str:
         """After the end of the run, what of the recording is not on disk; empty if it is complete."""
         return self._journal.unfinished

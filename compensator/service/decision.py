@@ -150,7 +150,7 @@ class OffsetDecision:
         has_zero: bool,
         memory: Memory,
         plausibility: PlausibilityCheck,
-        jumps: JumpWatch | None = None,
+        jumps: JumpWatch | None,
     ) -> Condition:
         """Return what a sample means for every axis; called once for each sample.
 

@@ -69,10 +69,16 @@ class Machine:
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
             await self.promises.wait(self.config.sampling.poll_interval_s / 60.0)
-            while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
+            while self.waits_for_diagnoses and self.is_diagnosing:
                 await asyncio.sleep(0.002)
 
         self.clock = VirtualClock(start_ns, advance)
+
+    @property
+    def is_diagnosing(self) -> bool:
+        """Whether a diagnosis, or what follows from it, is in progress beside the samples."""
+        loop = self.daemon._loop if self.daemon is not None else None
+        return loop is not None and loop.is_working
 
     def publish(self, name: str, data: bytes) -> None:
         """Take a message."""

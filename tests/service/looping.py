@@ -15,10 +15,10 @@ from compensator.config import Config
 from compensator.events import Note
 from compensator.messages import Sample
 from compensator.model.effects import Effect, effect_from
+from compensator.model.effects.names import effect_names
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
-from compensator.service.loop.weighing import effect_names
 from compensator.service.outcome import Outcome
 from tests.service.records import QUILL, sample
 from tests.service.simulated import config
@@ -67,7 +67,7 @@ def _with(*effects: Effect) -> bytes:
 
 def shown(model: bytes | None, verdict: str = "explained") -> Diagnosed:
     """A diagnosis that has found a model."""
-    effects = tuple(effect_names(parse_model(model, source="test"))) if model is not None else ()
+    effects = tuple(effect_names(parse_model(model, source="test").effects)) if model is not None else ()
     return Diagnosed(verdict, effects, model, "a diagnosis", needs="")
 
 

@@ -21,8 +21,8 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import adoption
 from compensator.service.transfer.adoption import Adoption
-from compensator.service.transfer.candidate import ModelCandidate
 from compensator.service.transfer.model_store import ModelStore, sha256_of
+from compensator.service.transfer.warm_up import Successor
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 
@@ -170,7 +170,7 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
 ) -> None:
     machine = Machine(tmp_path / "a")
     held, loop = threading.Event(), asyncio.get_running_loop()
-    prepare = Adoption._candidate
+    prepare = Adoption._successor
 
     def slow(self: Adoption, *arguments: Any) -> Any:
         warmed = prepare(self, *arguments)
@@ -178,7 +178,7 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
         assert held.wait(120.0)
         return warmed
 
-    monkeypatch.setattr(Adoption, "_candidate", slow)
+    monkeypatch.setattr(Adoption, "_successor", slow)
     asked = machine.at_sample[150] = Asked(machine, "adopt", payload(STRONGER))
     second = machine.at_sample[160] = Asked(machine, "back")
 
@@ -241,7 +241,7 @@ async def test_a_model_that_fails_as_it_takes_over_is_not_found_at_the_next_star
     def broken(*_: Any) -> None:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(ModelCandidate, "update", broken)
+    monkeypatch.setattr(Successor, "follow", broken)
     await machine.run(90)
     assert {outcome.offset.model_sha256 for outcome in machine.outcomes} == {sha256_of(QUILL)}
     assert {outcome.offset.state for outcome in machine.outcomes} <= {"ok", "degraded"}

@@ -11,7 +11,7 @@ from compensator.messages import Event
 from compensator.service.compensation import Compensation
 from compensator.service.replay import RecordedStep
 from compensator.service.state import decode_state
-from compensator.service.transfer.candidate import RecordedRun
+from compensator.service.transfer.warm_up import RecordedRun
 from tests.service.jumping import BEGIN, END, is_wrong_in_ok, readings, run, settings, steps, working_day
 from tests.service.records import QUILL, sample
 

@@ -17,8 +17,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.events import DiagnosisData
 from compensator.service.loop.avoided import avoid, is_avoided
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Place, decode_loop
+from compensator.service.loop.state import Place, Role, decode_loop
 from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_NS

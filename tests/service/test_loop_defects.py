@@ -14,8 +14,8 @@ from compensator.service.journal import Journal
 from compensator.service.loop import found, live
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.shadow import Shadow
 from compensator.service.transfer.model_store import ModelStore, sha256_of
+from compensator.service.transfer.shadow import Shadow
 from tests.service.living import MACHINE
 from tests.service.looping import extended, shown, stronger
 from tests.service.test_loop_service import EVENING, Asked, Looping, checked

@@ -18,9 +18,8 @@ from compensator.errors import ConfigError
 from compensator.events import EventKind
 from compensator.messages import ProbeRequest, Sample, number
 from compensator.model.model_file import parse_model
-from compensator.service.loop.core import warmed_on
 from compensator.service.loop.record import usable_table
-from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
+from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep, warmed_on
 from compensator.service.loop.trust import is_alarmed
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of

@@ -24,13 +24,13 @@ from compensator.messages import Candidate, Event
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.loop.process import DiagnosisProcess
-from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import model_store
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.shadow import Shadow
 from compensator.watch.history import STEP_NS, MachineHistory
 from compensator.watch.past import last_day
 from tests.audit.made import CONFIG

@@ -9,9 +9,9 @@ import pytest
 from compensator.codes import Reason
 from compensator.model.model_file import parse_model
 from compensator.service.compensation import Compensation
-from compensator.service.loop.core import warmed_on
-from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.run import warmed_on
 from compensator.service.outcome import Outcome, sets_zero_at_rest
+from compensator.service.transfer.shadow import Shadow
 from tests.service.looping import extended, machine, settings, stronger
 
 RECORD = 3000

@@ -28,14 +28,14 @@ from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.found import Found
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.run import LoopRun, LoopStep
-from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import LoopState, Place, Running
 from compensator.service.loop.weighing import Weighed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
-from compensator.service.transfer import candidate, model_store
+from compensator.service.transfer import model_store, warm_up
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
+from compensator.service.transfer.shadow import Shadow
 from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
 from tests.service.test_loop_run import CHECKED
@@ -360,7 +360,7 @@ async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_opera
     machine = Looping(tmp_path, shown(extended()), shown(stronger(0.1)), policy="propose")
     machine.use(machine.config_bytes.replace(b"shadow_h = 6.0", b"shadow_h = 48.0"))
     await machine.run(1800, until=in_phase(machine, "shadow"))
-    works, adopted, warmed = candidate.warm_up, threading.Event(), threading.Event()
+    works, adopted, warmed = warm_up.warm_up, threading.Event(), threading.Event()
 
     def late(*arguments: Any, **settings: Any) -> Any:
         machine.at_sample[len(machine.outcomes) + 5] = Asked(machine, "adopt", candidate=True, force=True)

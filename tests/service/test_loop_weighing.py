@@ -7,9 +7,10 @@ import math
 from typing import Any
 
 from compensator.model.effects import effect_from
+from compensator.model.effects.names import effect_names
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.loop.weighing import difference, effect_names, off_at_zero
+from compensator.service.loop.weighing import difference, off_at_zero
 
 
 def coolant(gain: float) -> tuple[str, dict[str, Any]]:
@@ -31,7 +32,7 @@ def extended(*effects: tuple[str, dict[str, Any]]) -> ThermalModel:
 def test_the_own_error_beside_a_named_effect_makes_no_other_explanation_of_it() -> None:
     first = extended(coolant(2.0), remainder("heat_w", "floor_degc"))
     again = extended(coolant(2.3), remainder("heat_w", "coolant_degc", "at_degc"))
-    assert effect_names(first) == effect_names(again) == ["input:coolant_degc"]
+    assert effect_names(first.effects) == effect_names(again.effects) == ["input:coolant_degc"]
     same, deviations = difference(again, first)
     assert same and math.isclose(deviations, 3.0)
     assert difference(extended(coolant(2.0)), first) == (True, 0.0)
@@ -75,6 +76,6 @@ def test_a_remainder_of_other_gains_is_another_model() -> None:
 
 def test_a_remainder_alone_is_told_by_its_channels() -> None:
     first, again = extended(remainder("heat_w", "floor_degc")), extended(remainder("heat_w", "coolant_degc"))
-    assert effect_names(first) == ["regression:heat_w+floor_degc"]
+    assert effect_names(first.effects) == ["regression:heat_w+floor_degc"]
     assert difference(again, first) == (False, math.inf)
     assert not difference(extended(coolant(2.0)), first)[0]

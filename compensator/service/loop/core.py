@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import msgspec
 from msgspec.structs import replace as replace_fields
 
-from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import DataError
 from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
-from compensator.messages import Candidate
+from compensator.messages import SCHEMA, Candidate
+from compensator.model.effects.names import effect_names
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.shadow import Shadow, candidate_message
 from compensator.service.loop.state import LoopState, Role, decode_loop
-from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
-from compensator.service.outcome import sets_zero_at_rest
-from compensator.service.status import Handover, Zero
+from compensator.service.loop.weighing import Diagnosed, Weighed, weigh, without_candidate
+from compensator.service.status import Handover
 from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.shadow import Shadow
 
 #: Attachment of a recording: state of the loop.
 LOOP_STATE = "loop.json"
@@ -79,7 +78,7 @@ class ModelLoop:
         self.present = present
         data = attachments.get(LOOP_STATE)
         state = decode_loop(data) if data is not None else None
-        self.loop = Loop(config.loop, present.period_s, effect_names(present), state)
+        self.loop = Loop(config.loop, present.period_s, effect_names(present.effects), state)
         #: The models in shadow, by hash; one without a place has ended, and goes before the next sample.
         self.shadows: dict[str, Shadow] = {}
         for sha256, files in shadow_files(self.state).items():
@@ -119,7 +118,7 @@ class ModelLoop:
         # What a status shows comes last.
         shown = self.state.shown
         messages = tuple(
-            candidate_message(
+            _message(
                 present,
                 others[place.sha256],
                 place.role,
@@ -176,7 +175,7 @@ class ModelLoop:
         """Begin to compare what a diagnosis has found, in its state after the last sample."""
         model = compensation.model
         self.shadows[model.sha256] = Shadow(compensation, data)
-        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
+        self.loop.shadow_begins(model.sha256, effect_names(model.effects), now_ns, role, error=error)
         self.drop_ended()
 
     def offset_change_um(self, present: Compensation, sha256: str) -> float | None:
@@ -251,7 +250,7 @@ def _exchange_note(action: str, old: Compensation, new: Compensation, verdict: C
         "by": "loop",
         "old_sha256": old.model.sha256,
         "new_sha256": new.model.sha256,
-        "effects": effect_names(new.model),
+        "effects": effect_names(new.model.effects),
         "state_known": after.is_known,
         "difference_um": difference,
         "level_um": level_um,
@@ -261,43 +260,27 @@ def _exchange_note(action: str, old: Compensation, new: Compensation, verdict: C
     return Note(EventKind.ADOPT, text, data)
 
 
-def warmed_on(
-    config: Config,
-    model: ThermalModel,
-    record: Sequence[Outcome],
-    at_rest: Outcome | None = None,
-    error: ErrorBlocks | None = None,
-) -> Compensation:
-    """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
-
-    It starts with the last zero at rest, from which effects count their channels, also where the record begins later.
-
-    Parameters
-    ----------
-    record : sequence of Outcome
-        Outcomes in order; what is missing between two of them is a pause.
-    at_rest : Outcome, optional
-        That of the last zero at rest before the record.
-    error : ErrorBlocks, optional
-        Gets its errors.
-    """
-    compensation = Compensation(config, model)
-    compensation.begin(None)
-    shadow = Shadow(compensation, b"")
-    begin = max((i for i, outcome in enumerate(record) if sets_zero_at_rest(outcome)), default=-1)
-    last = record[begin] if begin >= 0 else at_rest
-    if last is not None:
-        shadow.process(last)
-    else:
-        zero = next((found for outcome in record if (found := Zero.set_in(outcome.estimate)) is not None), None)
-        if zero is not None:
-            compensation.begin(zero)
-    for outcome in record[begin + 1 :]:
-        if last is not None:
-            apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
-            compensation.pause(round(apart) - 1)
-        _, other = shadow.process(outcome)
-        if error is not None:
-            error.update(other)
-        last = outcome
-    return compensation
+def _message(
+    present: Outcome, other: Outcome, role: Role, verdict: ComparisonData, judged_h: float, probes: int
+) -> Candidate:
+    """Return the message of a sample."""
+    return Candidate(
+        schema=SCHEMA,
+        machine=present.sample.machine,
+        seq=present.sample.seq,
+        time_utc_ns=present.sample.time_utc_ns,
+        model_sha256=other.offset.model_sha256,
+        role=role,
+        y_pred_um=other.estimate.y_pred_um,
+        y_std_um=other.estimate.y_std_um,
+        residual_um=other.estimate.residual_um,
+        present_residual_um=present.estimate.residual_um,
+        innovations_um=[probe.innovation_um for probe in other.probes],
+        reasons=other.offset.reasons,
+        verdict=verdict.verdict,
+        present_rms_um=verdict.present_rms_um,
+        candidate_rms_um=verdict.candidate_rms_um,
+        deviations=verdict.deviations,
+        hours=judged_h,
+        probes=probes,
+    )

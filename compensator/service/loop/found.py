@@ -14,12 +14,12 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.process import Diagnose
-from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import Weighed, failed, without_effect
-from compensator.service.transfer.candidate import warm_up
 from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.shadow import Shadow
 from compensator.service.transfer.turns import give_way
+from compensator.service.transfer.warm_up import warm_up
 
 log = logging.getLogger("compensator")
 
@@ -76,12 +76,9 @@ class Found:
         shadow = Shadow(compensation, b"")
         try:
             for outcome in self.since:
-                missing = outcome.sample.seq - compensation.status.seq - 1
-                if missing < 0:
-                    continue
-                if compensation.status.seq >= 0:
-                    compensation.pause(missing)
-                errors.update(shadow.process(outcome)[1])
+                followed = shadow.follow(outcome)
+                if followed is not None:
+                    errors.update(followed)
         except Exception as error:
             # What runs in shadow already goes on.
             log.exception("internal error in a warm-up")

@@ -18,6 +18,7 @@ from compensator.config import Config
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.messages import Candidate, LoopStatus
+from compensator.model.effects.names import effect_names
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
@@ -28,7 +29,6 @@ from compensator.service.loop.place import role_of
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.status import loop_status
 from compensator.service.loop.storing import Storing, calibrated_effects
-from compensator.service.loop.weighing import effect_names
 from compensator.service.loop.words import named
 from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.model_store import ModelStore
@@ -260,7 +260,7 @@ class LiveLoop:
         def begin_anew(core: ModelLoop) -> None:
             self._cancel()
             core.present = present.model
-            effects, now_ns = effect_names(present.model), present.status.time_utc_ns
+            effects, now_ns = effect_names(present.model.effects), present.status.time_utc_ns
             calibrated = calibrated_effects(self._config, self._store, effects)
             self._note(core.loop.model_changed(effects, now_ns, calibrated=calibrated, back=back))
             core.drop_ended()

@@ -16,6 +16,7 @@ from compensator.clock import HOUR_NS
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
 from compensator.events import Note
+from compensator.model.effects.names import effect_names
 from compensator.recording.container import Container
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
@@ -23,7 +24,6 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.core import LOOP_STATE, ModelLoop
 from compensator.service.loop.replaying import hand_over_all, recorded_loop
 from compensator.service.loop.storing import calibrated_effects
-from compensator.service.loop.weighing import effect_names
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.restart import Resumed
@@ -52,7 +52,7 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mo
     config = loaded.config
     if config.loop is None or not config.loop.is_on:
         return None
-    calibrated = calibrated_effects(config, store, effect_names(resumed.compensation.model))
+    calibrated = calibrated_effects(config, store, effect_names(resumed.compensation.model.effects))
     return _continued(loaded, resumed, calibrated)
 
 
@@ -81,7 +81,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
         if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
             resumed.notes += _complete(resumed, last)
             return core
-    effects, now_ns = effect_names(present.model), present.status.time_utc_ns
+    effects, now_ns = effect_names(present.model.effects), present.status.time_utc_ns
     if not last.is_last:
         # No clock was set while it was off, and nothing that it counts went on.
         core.state.time_utc_ns, core.state.misfit_min, core.state.usable_min = now_ns, 0.0, 0.0

@@ -11,19 +11,23 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from compensator.clock import HOUR_NS
+from compensator.clock import HOUR_NS, NS
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
 from compensator.messages import UNREADABLE, Candidate, Sample
+from compensator.model.effects.names import effect_names
+from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.loop.core import ModelLoop, warmed_on
+from compensator.service.loop.core import ModelLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
-from compensator.service.loop.weighing import Diagnosed, effect_names, failed, without_effect
+from compensator.service.loop.weighing import Diagnosed, failed, without_effect
 from compensator.service.outcome import sets_zero, sets_zero_at_rest
 from compensator.service.probing import ReceivedProbe
-from compensator.service.transfer.candidate import WARM_UP
+from compensator.service.status import Zero
+from compensator.service.transfer.shadow import Shadow
+from compensator.service.transfer.warm_up import WARM_UP
 
 __all__ = ["Diagnosed", "LoopRun", "LoopStep"]
 
@@ -113,7 +117,7 @@ class LoopRun:
     @property
     def effects(self) -> tuple[str, ...]:
         """Effects of the present model."""
-        return tuple(effect_names(self._compensation.model))
+        return tuple(effect_names(self._compensation.model.effects))
 
     def process(self, sample: Sample, probes: Sequence[ReceivedProbe] = ()) -> LoopStep:
         """Process a sample with the probes that arrived since the last one."""
@@ -251,3 +255,45 @@ class LoopRun:
             oldest_ns = min(oldest_ns, self._warm_ns - round(warm_up_h * HOUR_NS))
         while self._record[0].sample.time_utc_ns <= oldest_ns:
             self._record.popleft()
+
+
+def warmed_on(
+    config: Config,
+    model: ThermalModel,
+    record: Sequence[Outcome],
+    at_rest: Outcome | None = None,
+    error: ErrorBlocks | None = None,
+) -> Compensation:
+    """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
+
+    It starts with the last zero at rest, from which effects count their channels, also where the record begins later.
+
+    Parameters
+    ----------
+    record : sequence of Outcome
+        Outcomes in order; what is missing between two of them is a pause.
+    at_rest : Outcome, optional
+        That of the last zero at rest before the record.
+    error : ErrorBlocks, optional
+        Gets its errors.
+    """
+    compensation = Compensation(config, model)
+    compensation.begin(None)
+    shadow = Shadow(compensation, b"")
+    begin = max((i for i, outcome in enumerate(record) if sets_zero_at_rest(outcome)), default=-1)
+    last = record[begin] if begin >= 0 else at_rest
+    if last is not None:
+        shadow.process(last)
+    else:
+        zero = next((found for outcome in record if (found := Zero.set_in(outcome.estimate)) is not None), None)
+        if zero is not None:
+            compensation.begin(zero)
+    for outcome in record[begin + 1 :]:
+        if last is not None:
+            apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
+            compensation.pause(round(apart) - 1)
+        _, other = shadow.process(outcome)
+        if error is not None:
+            error.update(other)
+        last = outcome
+    return compensation

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from compensator.clock import Clock
 from compensator.config import Config
 from compensator.errors import CompensatorError, ServiceError
+from compensator.model.effects.names import effect_names
 from compensator.service.compensation import model_of
 from compensator.service.loop.core import ModelLoop
-from compensator.service.loop.weighing import effect_names
 from compensator.service.transfer.model_store import ModelStore
 
 log = logging.getLogger("compensator")
@@ -20,7 +20,7 @@ log = logging.getLogger("compensator")
 def calibrated_effects(config: Config, store: ModelStore, present: Sequence[str]) -> Sequence[str]:
     """Return the effects of the model that a person decided on last; those of the present one if it cannot be read."""
     try:
-        return effect_names(model_of(config, store.calibrated(), source="calibrated model"))
+        return effect_names(model_of(config, store.calibrated(), source="calibrated model").effects)
     except CompensatorError as error:
         log.error("the calibrated model cannot be read: %s", error)
         return present

@@ -19,6 +19,7 @@ from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError
 from compensator.events import DiagnosisData
 from compensator.model.effects import Effect
+from compensator.model.effects.names import effect_names, known_by, name_of
 from compensator.model.effects.regression import Regression
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
@@ -85,9 +86,9 @@ def without_effect(present: bytes, effect: str, *, calibrated: bytes) -> Diagnos
         raise ModelError(f"present model: no effect {effect} beside those of the calibrated one")
     text = f"measured and predicted Y have diverged: the model without {effect}, which may have ended"
     if all(one.kind == Regression.kind for one in kept):
-        return Diagnosed("", tuple(effect_names(base)), calibrated, text, without=effect)
+        return Diagnosed("", tuple(effect_names(base.effects)), calibrated, text, without=effect)
     less = dataclasses.replace(model, effects=(*base.effects, *kept))
-    return Diagnosed("", tuple(effect_names(less)), dump_model(less).encode(), text, without=effect)
+    return Diagnosed("", tuple(effect_names(less.effects)), dump_model(less).encode(), text, without=effect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +127,7 @@ def weigh(found: Diagnosed, config: Config, *, calibrated: bytes, present: Therm
     except CompensatorError as error:
         return Weighed(replace(plain, refused=str(error)), None)
     same, change = difference(model, present)
-    effects = effect_names(model)
+    effects = effect_names(model.effects)
     if same and model.sha256 == base.sha256:
         change = 0.0
     weighed = replace(
@@ -134,7 +135,7 @@ def weigh(found: Diagnosed, config: Config, *, calibrated: bytes, present: Therm
         effects=effects,
         candidate_sha256=model.sha256,
         candidate=model.name,
-        fewer=_is_way_back(effects, effect_names(present), found, config),
+        fewer=_is_way_back(effects, effect_names(present.effects), found, config),
         present_sha256=present.sha256,
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
@@ -146,8 +147,8 @@ def weigh(found: Diagnosed, config: Config, *, calibrated: bytes, present: Therm
 
 def off_at_zero(model: ThermalModel, base: ThermalModel) -> list[str] | None:
     """Return with which channels at 0 all that a model adds to another one is off at rest; None where it may not be."""
-    known = [name_of(effect) for effect in _known_by(base)]
-    added = [effect.off_at_zero for effect in _known_by(model) if name_of(effect) not in known]
+    known = [name_of(effect) for effect in known_by(base.effects)]
+    added = [effect.off_at_zero for effect in known_by(model.effects) if name_of(effect) not in known]
     channels = [each for each in added if each is not None]
     if not added or len(channels) < len(added):
         return None
@@ -181,40 +182,13 @@ def without_candidate(found: Diagnosed) -> DiagnosisData:
     )
 
 
-def effect_names(model: ThermalModel) -> list[str]:
-    """Return the effects that a model is known by, each by its kind and place."""
-    return [name_of(effect) for effect in _known_by(model)]
-
-
-def _known_by(model: ThermalModel) -> Sequence[Effect]:
-    """Return the effects with a name; without any, the remainder.
-
-    A remainder beside them is the base's own error: its channels differ from one diagnosis to the next, and what is
-    explained stays the same.
-    """
-    return [effect for effect in model.effects if effect.kind != Regression.kind] or model.effects
-
-
-def name_of(effect: Effect) -> str:
-    """Return kind and place of an effect.
-
-    Examples
-    --------
-    >>> from compensator.model.effects import effect_from
-    >>> name_of(effect_from("gain", {"path": "DTF", "change": 0.1}))
-    'gain:DTF'
-    """
-    channels = dict.fromkeys(effect.channels)
-    return ":".join(filter(None, (effect.kind, effect.path, "+".join(channels))))
-
-
 def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
     """Return whether two models have the same effects, and by how many standard deviations their parameters differ.
 
     In standard errors of the first model, which was found later: it was found on more of the effect, and says whether
     the parameters of the other one are still possible. Infinite where an effect has none and the parameters differ.
     """
-    own, others = ({name_of(effect): effect for effect in _known_by(one)} for one in (model, other))
+    own, others = ({name_of(effect): effect for effect in known_by(one.effects)} for one in (model, other))
     if own.keys() != others.keys():
         return False, math.inf
     return True, max((_change(effect, others[name]) for name, effect in own.items()), default=0.0)

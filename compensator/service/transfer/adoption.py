@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 
@@ -23,15 +23,13 @@ from compensator.clock import Clock
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import CommandName, ComparisonData, EventKind, NotJudged
+from compensator.model.effects.names import effect_names
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
-from compensator.service.loop.live import LiveLoop
-from compensator.service.loop.weighing import effect_names
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
-from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
 from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
 from compensator.service.transfer.second_opinion import (
@@ -42,6 +40,7 @@ from compensator.service.transfer.second_opinion import (
     worse_axes,
 )
 from compensator.service.transfer.turns import give_way
+from compensator.service.transfer.warm_up import WARM_UP, Successor, warm_up
 
 log = logging.getLogger("compensator")
 
@@ -95,10 +94,10 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Prepared:
-    """The file of a model, its candidate, and how it compares with the present model."""
+    """The file of a model, its compensation, and how it compares with the present model."""
 
     data: bytes
-    candidate: ModelCandidate
+    successor: Successor
     comparison: ComparisonData
 
 
@@ -113,6 +112,19 @@ class _Order:
     ready: _Prepared | None = None
     comparison: ComparisonData | None = None
     task: asyncio.Task[None] | None = None
+
+
+class Exchanger(Protocol):
+    """What changes the model of the service by itself."""
+
+    @property
+    def is_exchanging(self) -> bool:
+        """Whether a decided exchange has not happened yet: another change of the model has to wait."""
+        ...
+
+    def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
+        """Begin anew after a command has changed the model."""
+        ...
 
 
 class Adoption:
@@ -130,8 +142,8 @@ class Adoption:
         For events, the recording of another model, and the history of models.
     running : callable
         Returns the running compensation.
-    loop : LiveLoop, optional
-        The loop, which begins anew after a change of the model.
+    loop : Exchanger, optional
+        The loop, which changes the model, too, and begins anew after a command has.
     """
 
     def __init__(
@@ -144,7 +156,7 @@ class Adoption:
         *,
         clock: Clock,
         running: Callable[[], Compensation],
-        loop: LiveLoop | None = None,
+        loop: Exchanger | None = None,
     ) -> None:
         self._config = config
         self._recordings = recordings
@@ -192,12 +204,12 @@ class Adoption:
         if order is None or order.ready is None:
             return old
         self._order = None
-        candidate, comparison = order.ready.candidate, order.ready.comparison
-        new, before = candidate.compensation, old.status
+        successor, comparison = order.ready.successor, order.ready.comparison
+        new, before = successor.compensation, old.status
         has_offset = not math.isnan(before.target_um)
         try:
             for outcome in order.since:
-                candidate.update(outcome)
+                successor.follow(outcome)
             new.continue_from(msgspec.structs.replace(before.handover, model_changed=has_offset))
         except Exception as error:
             log.exception("internal error of a model that is adopted")
@@ -211,15 +223,15 @@ class Adoption:
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
         self._events.note(
             EventKind.ADOPT,
-            f"model {named[0]} replaces {named[1]}, warm-up {candidate.minutes / 60.0:.1f} h, "
+            f"model {named[0]} replaces {named[1]}, warm-up {successor.minutes / 60.0:.1f} h, "
             f"the offset moves by {difference:+.2f} µm; {described(without_move(comparison))}{_unwatched(new, old)}",
             {
                 "ok": True,
                 "action": order.action,
                 "old_sha256": old.model.sha256,
                 "new_sha256": new.model.sha256,
-                "effects": effect_names(new.model),
-                **candidate.figures(),
+                "effects": effect_names(new.model.effects),
+                **successor.figures(),
                 "difference_um": difference,
                 "y_std_um": after.std_um,
                 "comparison": comparison.table(),
@@ -260,11 +272,11 @@ class Adoption:
         """Prepare the model on another thread, then answer; the swap follows at the next sample."""
         running, now_ns = self._running(), self._clock.utc_ns()
         order.ready = await _in_thread(lambda: self._prepared(store, order, running.model, running.status.zero, now_ns))
-        candidate, comparison = order.ready.candidate, order.ready.comparison
-        model = candidate.compensation.model
-        how = f"warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
-        if not candidate.is_known:
-            std_um = candidate.compensation.status.std_um
+        successor, comparison = order.ready.successor, order.ready.comparison
+        model = successor.compensation.model
+        how = f"warmed up on {successor.samples} sample(s) of {successor.minutes / 60.0:.1f} h"
+        if not successor.is_known:
+            std_um = successor.compensation.status.std_um
             how += f", too little to determine its state: standard deviation {std_um:.1f} µm for now"
         order.reply.set_result(
             {
@@ -273,7 +285,7 @@ class Adoption:
                 f"{' against measured Y' if worse_axes(comparison) else ''}, {how}; {described(comparison)}",
                 "model": model.name,
                 "model_sha256": model.sha256,
-                **candidate.figures(),
+                **successor.figures(),
                 "comparison": comparison.table(),
             }
         )
@@ -298,7 +310,7 @@ class Adoption:
     def _prepared(
         self, store: ModelStore, order: _Order, running: ThermalModel, zero: Zero | None, now_ns: int
     ) -> _Prepared:
-        """Return the file of a model, its candidate and its comparison; store it for the next start; takes time."""
+        """Return the file of a model, its compensation and its comparison; store it for the next start; takes time."""
         data = _model_file(store, order)
         model = check_model(self._config, data, source=f"model {sha256_of(data)[:12]}")
         if model.sha256 == running.sha256:
@@ -307,7 +319,7 @@ class Adoption:
             raise ServiceError(
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
-        candidate = self._candidate(model, zero, order.request.force)
+        successor = self._successor(model, zero, order.request.force)
         comparison = order.comparison = self._compared(running, model, zero)
         refuse_if_worse(comparison, model, force=order.request.force or order.action == CommandName.BACK)
         self._check_not_given_up()
@@ -315,7 +327,7 @@ class Adoption:
             store.back(name=model.name, time_utc_ns=now_ns)
         else:
             store.adopt(data, name=model.name, time_utc_ns=now_ns)
-        return _Prepared(data=data, candidate=candidate, comparison=comparison)
+        return _Prepared(data=data, successor=successor, comparison=comparison)
 
     def _compared(self, running: ThermalModel, model: ThermalModel, zero: Zero | None) -> ComparisonData:
         if zero is None:
@@ -336,25 +348,25 @@ class Adoption:
         if self._given_up.is_set():
             raise ServiceError(_ENDING)
 
-    def _candidate(self, model: ThermalModel, zero: Zero | None, force: bool) -> ModelCandidate:
+    def _successor(self, model: ThermalModel, zero: Zero | None, force: bool) -> Successor:
         if zero is None:
-            return ModelCandidate(compensation=Compensation(self._config, model))
+            return Successor(compensation=Compensation(self._config, model))
         try:
-            candidate = warm_up(self._recordings, self._config, model, between_samples=self._turns())
+            successor = warm_up(self._recordings, self._config, model, between_samples=self._turns())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
             compensation = Compensation(self._config, model)
             compensation.begin(zero)
-            return ModelCandidate(compensation=compensation)
-        if not candidate.is_known and not force:
+            return Successor(compensation=compensation)
+        if not successor.is_known and not force:
             raise ServiceError(
-                f"model {model.name}: the recordings without a gap cover {candidate.minutes / 60.0:.1f} h, but "
+                f"model {model.name}: the recordings without a gap cover {successor.minutes / 60.0:.1f} h, but "
                 f"{WARM_UP:g} times the slowest time constant of {slowest_min(model) / 60.0:.1f} h is needed; the "
-                f"standard deviation of its offset would be {candidate.compensation.status.std_um:.1f} µm; "
+                f"standard deviation of its offset would be {successor.compensation.status.std_um:.1f} µm; "
                 f"{_ADVICE}"
             )
-        return candidate
+        return successor
 
 
 async def _in_thread(work: Callable[[], T]) -> T:

@@ -28,7 +28,7 @@ from compensator.service.probing import ProbingHandover
 from compensator.service.replay import RecordedStep, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.status import Handover
-from compensator.service.transfer.candidate import warm_up
+from compensator.service.transfer.warm_up import warm_up
 
 
 @dataclass(slots=True)

@@ -26,8 +26,8 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import RecordedStep
 from compensator.service.status import Zero
-from compensator.service.transfer.candidate import RecordedRun, Window, usable_steps, window_of
 from compensator.service.transfer.comparison import FEWEST, Comparison, changed, not_judged
+from compensator.service.transfer.warm_up import RecordedRun, Window, usable_steps, window_of
 
 #: How much of the record is compared, h.
 COMPARED_H = 24.0

@@ -25,6 +25,7 @@ from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
+from compensator.service.transfer.shadow import Shadow
 
 #: Longest warm-up, in slowest time constants: 0.03 % of the influence of earlier samples remains.
 WARM_UP = 8.0
@@ -33,7 +34,7 @@ _NEWEST = 100
 
 
 @dataclass(slots=True, kw_only=True)
-class ModelCandidate:
+class Successor:
     """A compensation that is ready to succeed another one.
 
     Parameters
@@ -55,19 +56,9 @@ class ModelCandidate:
     def __post_init__(self) -> None:
         self.is_known = self.compensation.status.is_known
 
-    def update(self, outcome: Outcome) -> None:
+    def follow(self, outcome: Outcome) -> None:
         """Process a live sample, with the zero that was set with it; a sample of the recordings is skipped."""
-        sample, last = outcome.sample, self.compensation.status.seq
-        if sample.seq <= last:
-            return
-        if last >= 0:
-            # The samples in between were not on disk in time for the warm-up.
-            self.compensation.pause(sample.seq - last - 1)
-        for note in outcome.notes:
-            if note.kind == EventKind.ZERO:
-                self.compensation.zero(note.data["mode"])
-        self.compensation.process(sample)
-        self.compensation.believe_wires(outcome.offset.reasons)
+        Shadow(self.compensation, b"").follow(outcome, probes=False)
 
     def figures(self) -> dict[str, Any]:
         """Return the extent of its warm-up for events and replies."""
@@ -82,7 +73,7 @@ def warm_up(
     between_samples: Callable[[], None] = lambda: None,
     probes: bool = False,
     seen: Callable[[Outcome], None] = lambda _: None,
-) -> ModelCandidate:
+) -> Successor:
     """Run a new compensation up to the end of the recordings, with the zero that is current there.
 
     It starts at the last zero at rest, or, if that is longer ago, `WARM_UP` times the model's slowest time constant
@@ -132,7 +123,7 @@ def warm_up(
     same = (zero.t_q_ref_degc, zero.at_ref_degc) == (newest.t_q_ref_degc, newest.at_ref_degc)
     if not same and model.inputs == "changes" and not zero.is_absolute:
         raise DataError(f"{folder}: the recordings do not contain the current zero")
-    return ModelCandidate(compensation=compensation, samples=run.samples, minutes=run.minutes)
+    return Successor(compensation=compensation, samples=run.samples, minutes=run.minutes)
 
 
 class RecordedRun:

@@ -11,10 +11,9 @@ import msgspec
 
 from compensator.codes import ProbeCode
 from compensator.config import Config
-from compensator.events import ComparisonData, EventKind
-from compensator.messages import SCHEMA, Candidate, Probe
+from compensator.events import EventKind
+from compensator.messages import Probe
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.loop.state import Role
 from compensator.service.probing import ReceivedProbe
 
 
@@ -46,8 +45,22 @@ class Shadow:
         compensation.restore(state)
         return cls(compensation, data)
 
+    def follow(self, outcome: Outcome, *, probes: bool = True) -> Outcome | None:
+        """Process a live sample after a warm-up on the recordings; None if they had it.
+
+        What lies between the two was not on disk in time for the warm-up: it is a pause. With `probes` probes correct
+        the prediction.
+        """
+        last = self.compensation.status.seq
+        missing = outcome.sample.seq - last - 1
+        if missing < 0:
+            return None
+        if last >= 0:
+            self.compensation.pause(missing)
+        return self.process(outcome if probes else msgspec.structs.replace(outcome, probes=()))[1]
+
     def process(self, outcome: Outcome) -> tuple[Outcome, Outcome]:
-        """Process a sample of the present compensation.
+        """Process the next sample of the present compensation.
 
         Returns
         -------
@@ -68,29 +81,3 @@ class Shadow:
 def _is_compared(probe: Probe) -> bool:
     """Return whether a probe passed the checks against what was published, which only the present model can make."""
     return probe.is_read and (probe.taken or probe.code == ProbeCode.OUTLIER)
-
-
-def candidate_message(
-    present: Outcome, other: Outcome, role: Role, verdict: ComparisonData, judged_h: float, probes: int
-) -> Candidate:
-    """Return the message of a sample."""
-    return Candidate(
-        schema=SCHEMA,
-        machine=present.sample.machine,
-        seq=present.sample.seq,
-        time_utc_ns=present.sample.time_utc_ns,
-        model_sha256=other.offset.model_sha256,
-        role=role,
-        y_pred_um=other.estimate.y_pred_um,
-        y_std_um=other.estimate.y_std_um,
-        residual_um=other.estimate.residual_um,
-        present_residual_um=present.estimate.residual_um,
-        innovations_um=[probe.innovation_um for probe in other.probes],
-        reasons=other.offset.reasons,
-        verdict=verdict.verdict,
-        present_rms_um=verdict.present_rms_um,
-        candidate_rms_um=verdict.candidate_rms_um,
-        deviations=verdict.deviations,
-        hours=judged_h,
-        probes=probes,
-    )
