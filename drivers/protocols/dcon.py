@@ -137,8 +137,7 @@ def thermocouple(text: str, form: str, span: Span, vendor: str | None) -> Readin
     text : str
         As `split_values` returns it.
     form : str
-        `engineering` (°C), `percent` (of the top of the range) or `hex` (two's complement, 7FFF = top of
-        the range).
+        `engineering` (°C), `percent` (of full scale) or `hex` (two's complement, 7FFF = full scale).
     span : Span
         Range of the thermocouple type in this maker's modules.
     vendor : str or None
@@ -163,7 +162,7 @@ def thermocouple(text: str, form: str, span: Span, vendor: str | None) -> Readin
     if abs(value) >= 9999.0:
         quality = Quality.OPEN if value > 0 else Quality.UNDER
         return Reading.bad(quality, f"open thermocouple or out of range ({text})")
-    return span.reading(value / 100.0 * span.high_degc if form == "percent" else value)
+    return span.reading(value / 100.0 * span.full_degc if form == "percent" else value)
 
 
 def _hexadecimal(text: str, span: Span, vendor: str | None) -> Reading:

@@ -36,7 +36,7 @@ class Span:
 
     @property
     def full_degc(self) -> float:
-        """Full scale of the two's complement format: the larger end of the range, °C."""
+        """Full scale of the percent and two's complement formats: the larger end of the range, °C."""
         return max(abs(self.low_degc), self.high_degc)
 
     def reading(self, value_degc: float) -> Reading:

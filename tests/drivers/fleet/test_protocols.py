@@ -208,6 +208,8 @@ def test_dcon_bodies_that_are_no_values(body: str) -> None:
 def test_dcon_scaling() -> None:
     icp, adam = ICPDAS["K"], ADVANTECH
     assert thermocouple("+100.00", "percent", icp, "icpdas").value == pytest.approx(1372.0)
+    # Type M has its full scale at -200 °C.
+    assert thermocouple("+010.00", "percent", ICPDAS["M"], "icpdas").value == pytest.approx(20.0)
     assert thermocouple("E6D0", "hex", icp, "icpdas").value == pytest.approx(-269.98, abs=0.01)
     assert thermocouple("7FFF", "hex", icp, "icpdas").quality is Quality.OPEN
     assert thermocouple("E000", "hex", adam["T"], "advantech").value == pytest.approx(-100.0)
