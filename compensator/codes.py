@@ -589,6 +589,11 @@ class DataRemark(Code):
         "Probes of several features are in a recording; each has a zero of its own, so only one of them is used.",
         "Probe one feature in a calibration.",
     )
+    ZEROS_LEFT_OUT = (
+        "zeros_left_out",
+        "A zero was set between probes; from there a feature counts anew, so only those about one zero are used.",
+        "Export the recordings of each zero to a table of their own: each table has a zero of its own.",
+    )
     VARIABLES_LEFT_OUT = (
         "variables_left_out",
         "Variables of a MAT file that do not have one value per row, such as matrices, are not read.",

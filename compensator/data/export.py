@@ -18,10 +18,10 @@ from msgspec import UNSET
 
 from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
-from compensator.data.files import measured_probes
+from compensator.data.probed import measured_probes, zeros_ns
 from compensator.data.table import MEASURED_HEAT, QUALITY
 from compensator.errors import DataError, of_files
-from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
+from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample, number
 from compensator.messages_axes import UNITS, AxesEstimate, AxisOffset, RecordedOffsets, named_for, topic_of
 from compensator.recording.reading import machines_in, messages, recordings_in
 
@@ -32,7 +32,7 @@ PathLike = str | os.PathLike[str]
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "y_ref_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 _SLOPE = ("y_slope_um_per_m", "y_slope_rate_um_per_m_per_min", "y_slope_std_um_per_m")
-_TOPICS = ("sample", "estimate", "offsets", *(topic_of(axis) for axis in UNITS), "probe")
+_TOPICS = ("sample", "estimate", "offsets", *(topic_of(axis) for axis in UNITS), "probe", "event")
 #: Values of further axes that the table has; a measured value is in the column of its channel.
 _OF_AXES = ("_dtf_", "_tdtf_", "_pred_", "_std_", "_ref_", "_residual_")
 
@@ -73,6 +73,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         raise DataError("recordings: empty, expected a recording, a folder of them, or a list of those")
     rows: dict[int, dict[str, Any]] = {}
     probes: list[list[Probe]] = []
+    events: list[Event] = []
     middles: dict[int, tuple[int, int]] = {}
     machines: dict[str, Path] = {}
     for recording in paths:
@@ -83,6 +84,9 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
             if isinstance(message, Probe):
                 probes[-1].append(message)
                 continue
+            if isinstance(message, Event):
+                events.append(message)
+                continue
             if isinstance(message, Sample):
                 middles[message.seq] = message.time_utc_ns - message.behind_ns, round(0.5e9 * message.period_s)
             rows.setdefault(message.seq, {}).update(_cells(message))
@@ -92,7 +96,8 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
     rows = dict(sorted(rows.items()))
-    _add_probes(str(paths[0]), rows, probes, middles)
+    zeros = zeros_ns(events, {seq: row["_ns"] for seq, row in rows.items()})
+    _add_probes(str(paths[0]), rows, probes, zeros, middles)
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
@@ -115,6 +120,7 @@ def _add_probes(
     name: str,
     rows: dict[int, dict[str, Any]],
     recorded: Sequence[Sequence[Probe]],
+    zeros: Sequence[int],
     middles: Mapping[int, tuple[int, int]],
 ) -> None:
     """Add `y_um` to the rows around the middle of whose polls a probe was measured; one outside of all is left out.
@@ -126,7 +132,7 @@ def _add_probes(
     """
     if not any(recorded) or any(row.get("y_um") is not None for row in rows.values()):
         return
-    probes, remarks = measured_probes(name, recorded)
+    probes, remarks = measured_probes(name, recorded, zeros)
     for remark in remarks:
         log.warning("%s", remark.marked)
     begins = sorted((middle - half, seq) for seq, (middle, half) in middles.items())

@@ -13,19 +13,19 @@ import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
-from compensator.codes import DataRemark, ProbeCode, Remark
+from compensator.codes import DataRemark, Remark
 from compensator.data import mat_reader
 from compensator.data.cells import text_of, with_points
 from compensator.data.frames import table_in_memory
 from compensator.data.mat_reader import DAMAGED
+from compensator.data.probed import measured_probes, zeros_ns
 from compensator.data.table import DATA_ROLES, TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
-from compensator.messages import Probe, number
+from compensator.messages import Event, Probe, number
 from compensator.recording.reading import messages
 
 #: First bytes of files that are mistaken for tables, and what to do with such a file.
@@ -206,8 +206,8 @@ def read_workbook(path: Path, roles: Mapping[str, str]) -> Table:
 def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read recordings that follow each other as one table; each has the columns that the roles name.
 
-    Where no displacement sensor measured Y, the values of touch probes are `y_um`, each in a row of its own: as much
-    later than the probe as the time of a sample, its end, is than the middle of its polls.
+    Where no displacement sensor measured Y, the values of touch probes of one level are `y_um`, each in a row of its
+    own: as much later than the probe as the time of a sample, its end, is than the middle of its polls.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
         if role in roles:
             raise DataError(f"{paths[0]}: --column {role}={roles[role]}: a recording has a time of its own")
     parts = [_read_recording(path) for path in paths]
-    tables = [table.with_roles(roles) for table, _ in parts]
+    tables = [part.table.with_roles(roles) for part in parts]
     names = dict.fromkeys(name for table in tables for name in table.columns)
     t_s = np.concatenate([table.t_s for table in tables])
     columns = {
@@ -227,76 +227,59 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     }
     remarks: tuple[Remark, ...] = ()
     if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        probes, remarks = measured_probes(str(paths[0]), [some for _, some in parts])
+        zeros = [time_ns for part in parts for time_ns in part.zeros_ns]
+        probes, remarks = measured_probes(str(paths[0]), [part.probes for part in parts], zeros)
         if probes:
+            behind_ns = max(part.behind_ns for part in parts)
             blank = np.full(len(probes), np.nan)
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
             values = [number(probe.deformation_um) for probe in probes]
             columns["y_um"] = np.concatenate([np.full(t_s.size, np.nan), values])
-            t_s = np.concatenate([t_s, [probe.time_utc_ns / 1e9 for probe in probes]])
+            t_s = np.concatenate([t_s, [(probe.time_utc_ns + behind_ns) / 1e9 for probe in probes]])
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
 
 
-def measured_probes(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:
-    """Return the probes of recordings that are a measured Y, those of the feature that has most."""
-    shown, untold = _showing_deformation(name, recordings)
-    probes, several = _of_one_feature(name, shown)
-    return probes, (*untold, *several)
+class _Recording(NamedTuple):
+    """What a recording has for a table.
 
-
-#: Why a probe is refused, too, if the control applied nothing.
-_APPLIED_NOTHING = (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD)
-
-
-def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
-    """Return the probes of the feature that has most: each feature has a zero of its own."""
-    counts = Counter(probe.feature for probe in probes)
-    if len(counts) < 2:
-        return list(probes), ()
-    feature, count = counts.most_common(1)[0]
-    words = f"{name}: y_um is that of feature {feature!r}, {count} probe(s); {len(probes) - count} of others left out."
-    return [probe for probe in probes if probe.feature == feature], (Remark(DataRemark.FEATURES_LEFT_OUT, words),)
-
-
-def _showing_deformation(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:
-    """Return the probes of recordings that are a measured Y: taken, or refused only because nothing was applied.
-
-    That nothing was applied is believed of a calibration: where others show that an offset was, what a refused probe
-    shows is unknown.
+    Parameters
+    ----------
+    table : Table
+        Its samples; the time counts from 1970.
+    probes : list of Probe
+        All of its probes.
+    zeros_ns : list of int
+        Times of the samples with which a zero was set, ns since 1970 UTC.
+    behind_ns : int
+        Time from the middle of the polls of a sample to its end.
     """
-    shown: list[Probe] = []
-    untold = 0
-    for probes in recordings:
-        is_calibration = not any(probe.offset_applied_um for probe in probes)
-        for probe in probes:
-            if probe.deformation_um is None:
-                continue
-            applied_nothing = probe.code in _APPLIED_NOTHING and probe.offset_applied_um == 0.0
-            if probe.taken or (applied_nothing and is_calibration):
-                shown.append(probe)
-            else:
-                untold += applied_nothing
-    if not untold:
-        return shown, ()
-    words = f"{name}: {untold} refused probe(s) with offset_applied_um = 0 left out: others show that one was applied."
-    return shown, (Remark(DataRemark.PROBES_LEFT_OUT, words),)
+
+    table: Table
+    probes: list[Probe]
+    zeros_ns: list[int]
+    behind_ns: int
 
 
-def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
-    """Return the samples of a recording, whose time counts from 1970, and its probes with the times of their rows."""
+def _read_recording(path: Path) -> _Recording:
     times: list[int] = []
     behind_ns = 0
     samples: list[dict[str, float]] = []
     probes: list[Probe] = []
-    for message in messages(path, ("sample", "probe")):
+    events: list[Event] = []
+    ends_ns: dict[int, int] = {}
+    for message in messages(path, ("sample", "probe", "event")):
         if isinstance(message, Probe):
             probes.append(message)
+            continue
+        if isinstance(message, Event):
+            events.append(message)
             continue
         # A sample in which the service began has fewer polls.
         behind_ns = max(behind_ns, message.behind_ns)
         times.append(message.time_utc_ns)
+        ends_ns[message.seq] = message.time_utc_ns
         samples.append(
             {name: number(channel.mean) if channel.is_good else math.nan for name, channel in message.channels.items()}
         )
@@ -305,4 +288,4 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
     names = dict.fromkeys(name for row in samples for name in row)
     columns = {name: np.array([row.get(name, math.nan) for row in samples]) for name in names}
     table = Table(name=str(path), t_s=np.array(times) / 1e9, columns=columns, rows=range(2, len(times) + 2))
-    return table, [replace(probe, time_utc_ns=probe.time_utc_ns + behind_ns) for probe in probes]
+    return _Recording(table, probes, zeros_ns(events, ends_ns), behind_ns)

@@ -6,13 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import compensator as tc
+from compensator.data.measurement import measurements, runs_in
+from compensator.data.probed import zeros_ns
 from compensator.data.runs import is_sparse
+from compensator.messages import Event
 from compensator.recording.reading import recordings
+from compensator.service.loop.record import usable_table
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE
 from tests.service.probed import PROBE, PROBED, ProbedMachine
+
+WIDE = PROBED.replace(b"measured_max_um = 60.0", b"measured_max_um = 200.0")
 
 
 def read(machine):
@@ -41,8 +48,7 @@ async def test_probes_are_the_measured_y_of_a_recording(tmp_path: Path) -> None:
 
 async def test_a_control_that_applied_nothing_shows_the_whole_deformation(tmp_path: Path) -> None:
     """As during a calibration: the service refuses such a probe for its own use, and the recording has it."""
-    config = PROBED.replace(b"measured_max_um = 60.0", b"measured_max_um = 200.0")
-    machine = ProbedMachine(tmp_path, noise_um=0.0, config=config)
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=WIDE)
     grown = []
 
     def probe() -> None:
@@ -65,6 +71,65 @@ async def test_only_one_feature_is_used_and_said_so(tmp_path: Path) -> None:
     found = read(machine)
     assert np.isfinite(found.table.columns["y_um"]).sum() == 6
     assert [remark.code for remark in found.remarks] == ["features_left_out"]
+
+
+@pytest.mark.parametrize("zero_at", [130, 310])
+async def test_probes_about_the_zero_with_most_are_used_as_in_the_loop(tmp_path: Path, caplog, zero_at: int) -> None:
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=WIDE)
+    machine.each_hour(400, every=30)
+    machine.at_sample[zero_at] = lambda: machine.command("zero", b'{"mode": "warm"}')
+    # Ordered, and refused: no zero was set.
+    machine.at_sample[220] = lambda: machine.command("zero", b'{"mode": "cold"}')
+    await machine.run(420)
+    (_, zero) = machine.events("zero")
+    zero_ns = next(outcome.sample.time_utc_ns for outcome in machine.outcomes if outcome.sample.seq == zero.seq)
+    taken = [probe for probe in machine.recorded() if probe.taken]
+    level = [probe for probe in taken if (probe.time_utc_ns > zero_ns) == (zero_at < 200)]
+    assert len(taken) > len(level) >= 8
+    found = read(machine)
+    known = np.isfinite(found.table.columns["y_um"])
+    assert found.table.columns["y_um"][known].tolist() == [probe.deformation_um for probe in level]
+    (remark,) = found.remarks
+    assert remark.code == "zeros_left_out"
+    assert f"{len(level)} probe(s); {len(taken) - len(level)} about others left out" in remark
+    loop = usable_table(machine.outcomes)
+    measured = np.isfinite(loop.columns["y_um"])
+    assert found.table.t_s[known].tolist() == loop.t_s[measured].tolist()
+    assert found.table.columns["y_um"][known].tolist() == loop.columns["y_um"][measured].tolist()
+    tc.export(recordings(machine.recordings, MACHINE), tmp_path / "all.csv")
+    assert "zeros_left_out" in caplog.text
+    with (tmp_path / "all.csv").open() as file:
+        exported = [float(row["y_um"]) for row in csv.DictReader(file) if row["y_um"]]
+    assert exported == [probe.deformation_um for probe in level]
+
+
+def test_the_zero_of_a_lost_sample_has_the_time_of_its_event() -> None:
+    """A full disk: the event is written with a later sample, and what was ordered is no zero."""
+    zero = Event(schema=1, machine=MACHINE, seq=7, time_utc_ns=430, kind="zero", text="")
+    ordered = replace(zero, seq=6, kind="command")
+    assert zeros_ns([ordered, zero], {6: 360}) == [430]
+    assert zeros_ns([ordered, zero], {6: 360, 7: 420}) == [420]
+
+
+async def test_a_table_of_each_zero_keeps_all_probes(tmp_path: Path) -> None:
+    """What the remark advises: a zero was set between two recordings, and each is exported by itself."""
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=WIDE)
+    machine.each_hour(400, every=30)
+    await machine.run(200)
+    machine.at_sample[201] = lambda: machine.command("zero", b'{"mode": "warm"}')
+    await machine.run(200)
+    files = recordings(machine.recordings, MACHINE)
+    tables = [tmp_path / "day1.csv", tmp_path / "day2.csv"]
+    for recording, table in zip(files, tables, strict=True):
+        tc.export(recording, table)
+    runs, _ = runs_in(measurements(tables, "data"))
+    taken = sum(probe.taken for probe in machine.recorded())
+    assert [run.recording for run in runs] == [0, 1]
+    assert (
+        sum(np.isfinite(run.y_um).sum() for run in runs)
+        == taken
+        > np.isfinite(read(machine).table.columns["y_um"]).sum()
+    )
 
 
 async def test_an_exported_table_has_the_probes_of_the_recording(tmp_path: Path, caplog) -> None:
@@ -121,8 +186,7 @@ async def test_a_mismatch_among_probes_with_an_offset_is_no_measured_y(tmp_path:
 
 async def test_each_recording_says_by_itself_whether_the_control_applied_nothing(tmp_path: Path) -> None:
     """A calibration and a shift after it, exported together: the same values as DATA of both has."""
-    config = PROBED.replace(b"measured_max_um = 60.0", b"measured_max_um = 200.0")
-    machine = ProbedMachine(tmp_path, noise_um=0.0, config=config)
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=WIDE)
     for sample in range(60, 150, 30):
         machine.at_sample[sample] = lambda: machine.probe(measured_um=machine.truth_um(), offset_applied_um=0.0)
     await machine.run(160)

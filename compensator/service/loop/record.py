@@ -5,14 +5,12 @@ in which the fault was there already. Temperatures and other channels stay as th
 throughout. Only where T_Q, AT or Y stood still for an hour, as no live sensor does, are they left out, or each
 diagnosis of that record would be refused.
 
-Where Y is probed, the values of one feature about one zero are used, those of which there are most: at a zero the
-feature counts anew, and against the values before it that is a step which the machine did not make.
+Where Y is probed, the values of one level are used, as of any recording (`data.probed`).
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
+from compensator.data.probed import of_one_level
 from compensator.data.screening import dead_part
 from compensator.data.table import Table
 from compensator.errors import DataError
@@ -120,15 +119,14 @@ def _left_out_s(rows: Sequence[tuple[Sample, Offset | None]]) -> Vector:
 def _usable(
     probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]], zeros_ns: Sequence[int]
 ) -> list[Probe]:
-    """Return the taken probes outside of what is left out, of the feature and about the zero that have most."""
+    """Return the taken probes of one level outside of what is left out."""
     period_s = rows[0][0].period_s if rows else 0.0
-    groups: dict[tuple[str, int], list[Probe]] = {}
-    for probe in probes:
-        at_s = probe.time_utc_ns / NS
-        if probe.taken and not np.any((left_out - period_s <= at_s) & (at_s <= left_out)):
-            groups.setdefault((probe.feature, bisect_right(zeros_ns, probe.time_utc_ns)), []).append(probe)
-    # Of groups of the same size the last one.
-    return max(reversed(groups.values()), key=len, default=[])
+
+    def is_left_out(at_s: float) -> bool:
+        return bool(np.any((left_out - period_s <= at_s) & (at_s <= left_out)))
+
+    usable = [probe for probe in probes if probe.taken and not is_left_out(probe.time_utc_ns / NS)]
+    return of_one_level(usable, zeros_ns)
 
 
 def _with_probes(
