@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers import Quality
-from drivers.protocols.analogue import Probe, advantech_volts, icpdas_volts, reading_of
+from drivers.families.inputs import CapacitiveProbe, reading_of
+from drivers.protocols.analogue import advantech_volts, icpdas_volts
 from drivers.protocols.capancdt import BadReplyError, Blocks, channel_info, micrometres
 from drivers.protocols.dcon import BadTextError, checksum, command, reply, split_values, thermocouple
 from drivers.protocols.modbus import (
@@ -111,7 +112,7 @@ def test_voltages() -> None:
 
 @pytest.mark.parametrize("polarity", [1, -1])
 def test_probe_equation(polarity: int) -> None:
-    probe = Probe(um_per_v=5.0, polarity=polarity, standoff_um=50.0, volt_min=-9.9, volt_max=9.9)
+    probe = CapacitiveProbe(um_per_v=5.0, polarity=polarity, standoff_um=50.0, volt_min=-9.9, volt_max=9.9)
     assert reading_of(0.0, probe).value == 50.0
     assert reading_of(2.0, probe).value == 50.0 + polarity * 10.0
     assert reading_of(9.95, probe).quality is Quality.OVER
