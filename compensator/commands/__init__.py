@@ -1,4 +1,4 @@
-"""The commands: one module each, listed in `compensator.cli` and imported when called."""
+"""The commands: one module each, listed in `catalog` and imported when called."""
 
 from __future__ import annotations
 

@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.cli import COMMANDS, load, main
+from compensator.cli import load, main
+from compensator.commands.catalog import COMMANDS
 from compensator.config import Zenoh
 from compensator.demo.day import START_NS, run_day
 from compensator.demo.machine import configuration, hardware

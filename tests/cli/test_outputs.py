@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from compensator.cli import COMMANDS, main
+from compensator.cli import main
+from compensator.commands.catalog import COMMANDS
 from compensator.commands.outputs import Reads, Writes
 from compensator.report.formats import check_replaced, write
 from compensator.report.page import Page

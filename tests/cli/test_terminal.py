@@ -8,7 +8,8 @@ import subprocess
 
 import pytest
 
-from compensator.cli import COMMANDS, main
+from compensator.cli import main
+from compensator.commands.catalog import COMMANDS
 from compensator.commands.wrapping import styled, wrapped
 from compensator.display import Table
 

@@ -10,8 +10,9 @@ from types import ModuleType
 
 import pytest
 
-from compensator.cli import COMMANDS, _parser
+from compensator.cli import _parser
 from compensator.codes import WORDS
+from compensator.commands.catalog import COMMANDS
 from tests.deploy.guide import GUIDE, LAST, OPERATING, commands, with_table
 from tests.deploy.test_install import load
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from compensator.cli import COMMANDS
+from compensator.commands.catalog import COMMANDS
 from tests.manual.texts import codes, helps, in_live_page, in_sources, page, sentences
 
 #: Words that had to be read twice, or mean nothing to an engineer who did not write them.

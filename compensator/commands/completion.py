@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compensator.commands import Answer
+from compensator.commands.catalog import COMMANDS, Command
 
 _WHERE = """# compensator: completion of commands, options and files. To use it in every new shell:
 #   compensator completion bash > ~/.local/share/bash-completion/completions/compensator
@@ -29,9 +30,7 @@ _FISH = "# ~/.config/fish/completions/compensator.fish\n"
 
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
-    from compensator.cli import COMMANDS, options_of
-
-    options = {command.name: options_of(command) for command in COMMANDS}
+    options = {command.name: _options_of(command) for command in COMMANDS}
     if arguments.shell == "fish":
         lines = [
             f'complete -c compensator -n __fish_use_subcommand -f -a {command.name} -d "{command.text}"'
@@ -48,3 +47,11 @@ def run(arguments: argparse.Namespace) -> Answer:
         cases = "\n".join(f'    {name}) options="{" ".join(found)}" ;;' for name, found in options.items())
         text = (_ZSH if arguments.shell == "zsh" else _WHERE) + _BASH.format(commands=" ".join(options), cases=cases)
     return Answer({"shell": arguments.shell, "script": text}, text.rstrip("\n"))
+
+
+def _options_of(command: Command) -> list[str]:
+    """Return the options of a command, each by its longest name."""
+    parser = argparse.ArgumentParser(command.name)
+    command.describe(parser)
+    found = [max(action.option_strings, key=len) for action in parser._actions if action.option_strings]
+    return [*found, "--json", "--debug"]
