@@ -21,6 +21,9 @@ from compensator.recording.head import read_head
 from compensator.recording.naming import named_of, order_of
 from compensator.recording.signature import Verifier
 
+#: Number of remarks that the text of an audit has; a year of files may have one each.
+REMARKS = 20
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Audit:
@@ -496,9 +499,9 @@ def summary(found: Audit) -> str:
     return "\n".join(map(one_line, lines))  # names in them are those of the files
 
 
-def _shortened(remarks: Sequence[str], most: int = 20) -> list[str]:
-    """Return the first remarks; a year of files may have one each."""
-    kept = list(remarks[:most])
-    if len(remarks) > most:
-        kept.append(f"and {len(remarks) - most} more (--json lists all)")
+def _shortened(remarks: Sequence[str]) -> list[str]:
+    """Return the first remarks, and how many more there are."""
+    kept = list(remarks[:REMARKS])
+    if len(remarks) > REMARKS:
+        kept.append(f"and {len(remarks) - REMARKS} more (--json lists all)")
     return kept

@@ -40,7 +40,7 @@ EXCHANGED_CORRELATION = -0.3
 HEAT_K_PER_W = (0.0005, 20.0)
 
 
-def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool, needs_y: bool = True) -> None:
+def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool) -> None:
     """Refuse bad data.
 
     Parameters
@@ -51,8 +51,8 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
         The data.
     period_s : float
         Sample period, s.
-    needs_heat, needs_y : bool
-        Whether known heat is needed for a TTF; whether a deformation is needed.
+    needs_heat : bool
+        Whether known heat is needed for a TTF.
 
     Raises
     ------
@@ -68,9 +68,8 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
     screen_temperatures(name, runs)
     for run in runs:
         _check_alive(run, "y_um", run.y_um)
-    if needs_y:
-        require_y_noise(name, runs)
-        _check_deformation(name, runs)
+    require_y_noise(name, runs)
+    _check_deformation(name, runs)
     if needs_heat:
         _check_heat(name, runs)
 

@@ -153,7 +153,7 @@ class ChainWriter:
         self.links, self._before = [], self.head
 
 
-def seal(machine: str, time_ns: int, reason: str, sequence: int, head: bytes, public_key: str = "") -> Seal:
+def seal(machine: str, time_ns: int, reason: str, sequence: int, head: bytes) -> Seal:
     """Return a seal that is not signed yet."""
     return Seal(
         schema=SCHEMA,
@@ -162,7 +162,7 @@ def seal(machine: str, time_ns: int, reason: str, sequence: int, head: bytes, pu
         reason=reason,
         sequence=sequence,
         sha256=head.hex(),
-        public_key=public_key,
+        public_key="",
         signature="",
     )
 

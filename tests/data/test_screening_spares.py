@@ -51,7 +51,6 @@ def test_good_data_of_unusual_machines(changes):
 
 def test_only_what_is_needed_is_asked_for():
     screen("x.csv", runs_from(columns(heat_w=np.full(720, 90.0))), 60.0, needs_heat=False)
-    screen("x.csv", runs_from(columns(y_um=np.zeros(720))), 60.0, needs_heat=False, needs_y=False)
     without = columns()
     del without["heat_w"]
     screen("x.csv", runs_from(without), 60.0, needs_heat=False)
