@@ -9,18 +9,18 @@ from typing import Any
 
 from compensator.bridge.register import AxisPlace
 from compensator.bridge.settings import (
+    SIGN_BY,
     Connection,
     OpcUa,
     check_connection,
     check_value,
     opcua_from,
     opcua_table,
-    require_sign,
     with_files,
 )
 from compensator.errors import ConfigError
 from compensator.receiver import AxesSettings, AxisLimits, ReceiverError, Settings, load_any
-from compensator.receiver.settings import read_table
+from compensator.receiver.settings import read_table, require_sign
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +135,7 @@ def _load(receiver: AxesSettings, tables: dict[str, Any], path: str) -> OpcUaAxe
 
 def _axis(axis: str, limits: AxisLimits, table: dict[str, Any], path: str) -> PlcAxis:
     where = f"{path}: opcua.axis.{axis}"
-    require_sign(table, where)
+    require_sign(table, where, how=SIGN_BY)
     one = read_table(PlcAxis, table, source=path, name=f"opcua.axis.{axis}")
     check_value(one, where)
     if limits.sign != 1:

@@ -11,13 +11,15 @@ from urllib.parse import urlsplit
 from compensator.errors import ConfigError, one_line
 from compensator.input_file import KEY_BYTES, read_file, resolved
 from compensator.receiver import ReceiverError, Settings, load_settings
-from compensator.receiver.settings import read_table
+from compensator.receiver.settings import read_table, require_sign
 
 if TYPE_CHECKING:
     from cryptography.x509 import Certificate
 
 #: µm for each unit that the PLC may use.
 UNITS_UM = {"mm": 1000.0, "um": 1.0}
+#: How the sign of an offset is determined.
+SIGN_BY = "with a dial gauge"
 #: Security policies of OPC UA that are secure.
 POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss")
 C = TypeVar("C", bound="Connection")
@@ -119,7 +121,7 @@ def opcua_from(tables: dict[str, Any], path: str) -> OpcUa:
         As `load_bridge`.
     """
     table = opcua_table(tables, path, "receiver, opcua")
-    require_sign(table, f"{path}: opcua")
+    require_sign(table, f"{path}: opcua", how=SIGN_BY)
     opcua = read_table(OpcUa, table, source=path, name="opcua")
     check_value(opcua, f"{path}: opcua")
     check_connection(opcua, path)
@@ -140,16 +142,6 @@ def opcua_table(tables: dict[str, Any], path: str, expected: str) -> dict[str, A
     if tables:
         raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected {expected}")
     return table
-
-
-def require_sign(table: dict[str, Any], where: str) -> None:
-    """Refuse a table without the sign and who determined it."""
-    for key in ("sign", "sign_checked"):
-        if key not in table:
-            raise ReceiverError(
-                f"{where}.{key}: missing; determine the sign on this machine with a dial gauge, and enter "
-                f'who determined it, when and how (sign = 1 or -1, sign_checked = "…")'
-            )
 
 
 def with_files(opcua: C, path: str) -> C:

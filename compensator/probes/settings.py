@@ -12,13 +12,15 @@ from compensator.errors import ConfigError
 from compensator.input_file import resolved
 from compensator.probes.probe import Convention
 from compensator.receiver import ReceiverError
-from compensator.receiver.settings import check_apart, load_tables, read_table
+from compensator.receiver.settings import check_apart, load_tables, read_table, require_sign
 
 #: µm for each unit of a control.
 UNITS_UM = {"mm": 1000.0, "inch": 25400.0}
 _TABLES = ("folder", "dprnt", "linuxcnc")
 #: `sign_checked` of probes.example.toml, which nobody has checked.
 PLACEHOLDER = "date, who, how"
+#: How the sign of a reading is determined.
+_SIGN_BY = "by probing a feature with two offsets"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,7 +244,7 @@ def _service(path: Path, table: Mapping[str, Any]) -> Service:
 
 
 def _folder(path: Path, table: Mapping[str, Any]) -> Folder:
-    _require_sign(f"{path}: folder", table)
+    require_sign(table, f"{path}: folder", how=_SIGN_BY)
     folder = read_table(Folder, table, source=str(path), name="folder")
     _check_sign(f"{path}: folder", folder)
     _within(folder, {"poll_s": (0.02, 600.0)}, f"{path}: folder")
@@ -253,7 +255,7 @@ def _folder(path: Path, table: Mapping[str, Any]) -> Folder:
 
 def _dprnt(path: Path, table: Mapping[str, Any]) -> Dprnt:
     where = f"{path}: dprnt"
-    _require_sign(where, table)
+    require_sign(table, where, how=_SIGN_BY)
     dprnt = read_table(Dprnt, table, source=str(path), name="dprnt")
     _check_sign(where, dprnt)
     if bool(dprnt.address) == bool(dprnt.port):
@@ -278,7 +280,7 @@ def _dprnt(path: Path, table: Mapping[str, Any]) -> Dprnt:
 
 def _linuxcnc(path: Path, table: Mapping[str, Any]) -> LinuxCnc:
     where = f"{path}: linuxcnc"
-    _require_sign(where, table)
+    require_sign(table, where, how=_SIGN_BY)
     linuxcnc = read_table(LinuxCnc, table, source=str(path), name="linuxcnc")
     _check_sign(where, linuxcnc)
     if linuxcnc.unit not in UNITS_UM:
@@ -294,15 +296,6 @@ def address_of(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     valid = bool(host) and port.isascii() and port.isdigit() and 0 < int(port) < 65536
     return host.strip("[]"), int(port) if valid else 0
-
-
-def _require_sign(where: str, table: Mapping[str, Any]) -> None:
-    for key in ("sign", "sign_checked"):
-        if key not in table:
-            raise ReceiverError(
-                f"{where}.{key}: missing; determine the sign on this machine by probing a feature with two offsets, "
-                f'and enter who determined it, when and how (sign = 1 or -1, sign_checked = "…")'
-            )
 
 
 def _check_sign(where: str, settings: _Signed) -> None:

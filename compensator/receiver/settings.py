@@ -340,6 +340,31 @@ def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: st
     return kind(**values)
 
 
+def require_sign(table: Mapping[str, Any], where: str, *, how: str) -> None:
+    """Refuse a table of a bridge without the sign and who determined it.
+
+    Parameters
+    ----------
+    table : mapping
+        Keys and values.
+    where : str
+        File and table, for the message.
+    how : str
+        How the sign is determined.
+
+    Raises
+    ------
+    ReceiverError
+        If one of them is missing.
+    """
+    for key in ("sign", "sign_checked"):
+        if key not in table:
+            raise ReceiverError(
+                f"{where}.{key}: missing; determine the sign on this machine {how}, and enter who determined it, when "
+                'and how (sign = 1 or -1, sign_checked = "…")'
+            )
+
+
 _EXPECTED = {
     "str": "a text",
     "bool": "true or false",

@@ -217,7 +217,7 @@ async def _near(plc: Plc, um: float) -> bool:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("sign = -1\n", "", "opcua.sign: missing; determine the sign on this machine"),
+        ("sign = -1\n", "", "opcua.sign: missing; determine the sign on this machine with a dial gauge"),
         ("sign = -1\n", "sign = 0\n", "opcua.sign = 0: expected 1 or -1"),
         ("sign = -1\n", "sign = -1.0\n", "opcua.sign = -1.0: expected a whole number"),
         ('sign_checked = "2026-03-02, dial gauge, J. Novak"\n', "", "opcua.sign_checked: missing"),
