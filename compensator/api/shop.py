@@ -279,7 +279,7 @@ class _Followed:
         self.notes: tuple[Note, ...] = ()
 
     def __getattr__(self, name: str) -> Any:
-        """Return what is the same: model, status, zero, begin, hold, fail, held, continue_from."""
+        """Return what is that of the present compensation alone, such as its model, its status and its zero."""
         return getattr(self._run.compensation, name)
 
     def resume(self) -> None:

@@ -85,8 +85,7 @@ class ReplayCheck:
             followed = self._loop.process(outcome) if self._loop is not None else Followed((), ())
             self._compare(step, outcome, Followed(followed.candidates, (*decided, *followed.notes)))
         elif outcome is not None:
-            held = self.compensation.held_axes(outcome.machine, outcome.seq, outcome.time_utc_ns)
-            self._compare_held(step, held)
+            self._compare_held(step, outcome)
         else:
             self._incomplete = self._of_no_sample(step)
 

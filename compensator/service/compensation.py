@@ -127,12 +127,8 @@ class Compensation(Continuity):
         """Hold the offset because of an internal error, until `resume`."""
         self._memory.internal_error = True
 
-    def held(self, machine: str, seq: int, time_utc_ns: int) -> Offset:
-        """Return the message of Y for a sample that could not be processed: the last offset is held."""
-        return self.held_axes(machine, seq, time_utc_ns)[0]
-
     def held_axes(self, machine: str, seq: int, time_utc_ns: int) -> tuple[Offset, ...]:
-        """Return the messages of all axes for a sample that could not be processed, that of Y first."""
+        """Return the last offsets of all axes for a sample that could not be processed, that of Y first."""
         known = self._memory.estimate is not None
         limited = self._limiter.hold() if known else None
         decision = Decision(State.HOLD if known else State.FAULT, [Reason.INTERNAL_ERROR], limited)

@@ -223,7 +223,7 @@ def apply(
     commands: bool = True,
     since: int | None = None,
     checked: bool = False,
-) -> Outcome | Offset | None:
+) -> Outcome | tuple[Offset, ...] | None:
     """Repeat what the service did with one recorded group: commands and errors of its number, then the sample.
 
     Parameters
@@ -241,8 +241,9 @@ def apply(
 
     Returns
     -------
-    Outcome or Offset or None
-        Outcome of the sample; the held offset if the group has no sample; None for events alone.
+    Outcome or tuple of Offset or None
+        Outcome of the sample; the held offsets of all axes, that of Y first, if the group has no sample; None for
+        events alone.
 
     Raises
     ------
@@ -264,7 +265,7 @@ def apply(
                 compensation.fail()
     if sample is None:
         assert held is not None
-        return compensation.held(held.machine, held.seq, held.time_utc_ns)
+        return compensation.held_axes(held.machine, held.seq, held.time_utc_ns)
     compensation.receive_probes(step.received_probes(checked=checked) if commands else ())
     try:
         # The guards set `quality` again, from `device_quality` alone.
@@ -296,7 +297,7 @@ class FreeRun:
         self._before_torn_um: float | None = None
         self._further_before_torn: Mapping[str, float] = {}
 
-    def run(self, step: RecordedStep, *, commands: bool = True) -> Outcome | Offset | None:
+    def run(self, step: RecordedStep, *, commands: bool = True) -> Outcome | tuple[Offset, ...] | None:
         """Run the next group, after the pause before it; see `apply`.
 
         Raises
@@ -330,7 +331,7 @@ class FreeRun:
         if isinstance(result, Outcome):
             self.seq, self.time_ns = result.sample.seq, result.sample.time_utc_ns
         elif result is not None and self.seq >= 0:
-            self.seq, self.time_ns = result.seq, result.time_utc_ns
+            self.seq, self.time_ns = result[0].seq, result[0].time_utc_ns
         return result
 
     def _pass_pause(self, step: RecordedStep, sample: Sample) -> None:

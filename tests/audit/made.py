@@ -149,7 +149,7 @@ class Service:
         state = self.compensation.state()
         self.note("error", text)
         self.compensation.fail()
-        offset = encode(self.compensation.held(MACHINE, self.seq, self.now_ns))
+        offset = encode(self.compensation.held_axes(MACHINE, self.seq, self.now_ns)[0])
         self._write([("offset", offset)], state)
         self.seq += 1
 
