@@ -211,15 +211,23 @@ def test_channels_that_read_0_at_a_zero_at_rest_are_known(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("own_um", "other_um", "blocks", "is_right"),
-    [(20.0, 1.0, 8, True), (20.0, 1.0, 7, False), (20.0, 3.0, 8, False), (0.1, 0.1, 8, False)],
+    ("own_um", "other_um", "blocks", "before_um", "is_right"),
+    [
+        (20.0, 1.0, 8, None, True),
+        (20.0, 1.0, 7, None, False),
+        (20.0, 3.0, 8, None, False),
+        (0.1, 0.1, 8, None, False),
+        (20.0, 1.0, 8, 9.0, True),
+        (20.0, 1.0, 8, 19.0, False),  # it was as wrong before, so nothing has ended
+    ],
 )
-def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, other_um, blocks, is_right):
+def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, other_um, blocks, before_um, is_right):
     """An effect has ended on a machine at rest: nothing changes any longer that could show it."""
+    before = ErrorBlocks(blocks=[(n, before_um) for n in range(-20, blocks) if before_um is not None])
     means = [(own_um + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(blocks)]
     place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
     place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
-    found = Compared(place, settings().loop, 60.0, ErrorBlocks())
+    found = Compared(place, settings().loop, 60.0, before)
     assert found.is_better_to_go_back_to(is_new=False) is is_right
 
 
@@ -318,3 +326,20 @@ def test_what_was_shown_of_the_level_goes_on_with_other_parameters_that_leave_a_
     # Else it must stay in hours of its own.
     after.error.blocks += [(n, 6.3) for n in range(now, until)]
     assert compared.shown_level_um == 6.3
+
+
+def test_that_an_effect_began_is_seen_in_what_older_parameters_left_before_the_record_of_the_newer_ones():
+    """A stop over a weekend: the record of the newer ones begins after it, and the effect began before it."""
+    begins, stops, goes_on, until = 12, 24, 100, 130
+    times = [*range(stops), *range(goes_on, until)]
+    present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in times])
+    left = [(n, 6.0 * (n % 2) if n < begins else 6.0) for n in times]
+    before = Place(sha256="a", effects=["delay:DTF"], role="candidate", since_utc_ns=stops * BLOCK_NS)
+    before.error = ErrorBlocks(blocks=left[: -until + goes_on + 10])
+    now = goes_on + 10
+    after = Place(sha256="b", effects=["delay:DTF"], role="candidate", since_utc_ns=now * BLOCK_NS)
+    after.error = ErrorBlocks(blocks=[one for one in left if goes_on <= one[0]])
+    compared = Compared(after, Loop(), 60.0, present)
+    assert compared.shown_level_um is None
+    compared.go_on_with(before, now * BLOCK_NS)
+    assert compared.shown_level_um == 6.0

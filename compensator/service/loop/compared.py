@@ -11,6 +11,7 @@ from compensator.arrays import rms_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
+from compensator.diagnose.change import QUIET
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
@@ -165,11 +166,15 @@ class Compared:
 
         Where an effect has ended on a machine at rest, nothing changes any longer. That measured Y had moved by itself
         to where the other model happens to be right is as unlikely as its error is small beside that of the present.
+        Where the present model has been as wrong all the time, nothing has ended: it is the level that is wrong.
         """
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
         if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
             return False
         own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
+        before = [mean for block, mean in self._present_error.blocks if block < residuals_um[0][0]]
+        if len(before) >= FEWEST > sum(abs(mean) < QUIET * own_um for mean in before):
+            return False
         return other_um <= ALONE_PART * own_um and other_um > 0.0
 
     @property
@@ -206,6 +211,7 @@ class Compared:
         place.level_utc_ns = before.level_utc_ns or before.since_utc_ns
         if shown.shown_level_um is None or self.shown_level_um is None:
             place.level_utc_ns = 0
+        place.error.go_on_after(before.error)
 
     def beside(self, rival: Place) -> ComparisonData:
         """Compare the model with another one in shadow, as if that were the present one, on the hours of both."""

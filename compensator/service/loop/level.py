@@ -70,6 +70,11 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
         if np.isfinite(residual_um) and not is_disturbed(outcome.offset.reasons):
             self.count, self.sum_um = self.count + 1, self.sum_um + residual_um
 
+    def go_on_after(self, before: ErrorBlocks) -> None:
+        """Take over what a model with the same effects has left before the first block."""
+        first = self.blocks[0][0] if self.blocks else self.number
+        self.blocks = [*(block for block in before.blocks if block[0] < first), *self.blocks][-_BLOCKS:]
+
     def move_clock(self, by_ns: int) -> None:
         """Move all times, as the clock was set."""
         by = round(by_ns / BLOCK_NS)
