@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from compensator.atomic_write import replace_file
+from compensator.data.probed import zeros_ns
 from compensator.errors import DataError
-from compensator.events import EventKind
 from compensator.input_file import RESULT_BYTES, read_file
 from compensator.messages import UNREADABLE, Event, Offset, Probe, Sample
 from compensator.recording.reading import files_since, messages, recordings
@@ -99,12 +99,11 @@ def read_record(job: Job) -> JobRecord:
     """Return the record of a job; of a damaged recording what comes before the damage."""
     samples: dict[int, Sample] = {}
     offsets: dict[int, Offset] = {}
-    probes, zeros = list[Probe](), set[int]()
+    probes, events = list[Probe](), list[Event]()
     for path in files_since(recordings(Path(job.recordings), job.machine), job.from_utc_ns):
         for message in _usable_messages(path):
             if isinstance(message, Event):
-                if message.kind == EventKind.ZERO and message.seq is not None:
-                    zeros.add(message.seq)
+                events.append(message)
             elif not job.from_utc_ns < message.time_utc_ns <= job.to_utc_ns:
                 continue
             elif isinstance(message, Sample):
@@ -113,11 +112,10 @@ def read_record(job: Job) -> JobRecord:
                 offsets[message.seq] = message
             else:
                 probes.append(message)
-    return JobRecord(
-        rows=[(samples[seq], offsets.get(seq)) for seq in sorted(samples)],
-        probes=probes,
-        zeros_ns=sorted(samples[seq].time_utc_ns for seq in zeros & samples.keys()),
-    )
+    rows = [(samples[seq], offsets.get(seq)) for seq in sorted(samples)]
+    ends_ns = {seq: sample.time_utc_ns for seq, sample in samples.items()}
+    zeros = [at for at in sorted(zeros_ns(events, ends_ns)) if job.from_utc_ns < at <= job.to_utc_ns]
+    return JobRecord(rows=rows, probes=probes, zeros_ns=zeros)
 
 
 def _usable_messages(path: Path) -> Iterator[Any]:
