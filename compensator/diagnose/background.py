@@ -38,6 +38,8 @@ SIZE_SHARE = 0.1
 MEAN_FOLDS, PATH_FOLDS = 2.0, 1.0
 #: A column that moves by less than this share of its largest value is one of rounding.
 STILL = 1e-9
+#: Most evaluations of the gradient in the search of the rest and of the sizes.
+EVALUATIONS = 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +114,7 @@ class Background:
         # The sizes of the base's own paths are known apart from those of channels.
         self.is_path = np.arange(len(inputs)) < paths
 
-    def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
+    def fitted(self, points: Points, explained: Vector, start: Rest) -> Regressed:
         """Fit to what named effects leave.
 
         Parameters
@@ -123,10 +125,8 @@ class Background:
             What the named effects add, µm.
         start : Rest
             Where the search of the rest begins.
-        steps : int
-            Most evaluations.
         """
-        return _Problem(self, points, explained).solved(start, steps)
+        return _Problem(self, points, explained).solved(start)
 
     def as_paths(self, banks: Matrix) -> Matrix:
         """Return gains, shape (inputs, lags), with those of the base's own paths as a model can have them."""
@@ -170,15 +170,14 @@ class _Problem:
         typical = points.typical_rest()
         self.typical_rest = np.log([typical.slow_um, typical.tau_min, typical.start_um])
 
-    def solved(self, start: Rest, steps: int) -> Regressed:
+    def solved(self, start: Rest) -> Regressed:
         """Return the regression with the most probable sizes."""
         sizes = np.where(self.is_path, self.typical_path, self.typical_size - 1.0)
         begin = np.concatenate([np.log([start.slow_um, start.tau_min, start.start_um]), sizes])
         bounds = [(np.log(1e-3), np.log(1e3)), (np.log(3.0), np.log(3e3)), *[(-12.0, 8.0)] * (sizes.size + 1)]
         begin = np.clip(begin, *np.array(bounds).T)
-        found = minimize(
-            self._with_gradient, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": steps}
-        )
+        options = {"maxfun": EVALUATIONS}
+        found = minimize(self._with_gradient, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return self._result(np.asarray(found.x), -float(found.fun))
 
     def _rest(self, x: Vector) -> Rest:

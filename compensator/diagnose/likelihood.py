@@ -28,6 +28,8 @@ from compensator.diagnose.whitening import Whitening
 FURTHEST = 6.0
 #: Step of a logarithm for its slope.
 STEP = 1e-3
+#: Most evaluations of the gradient in the search of the rest.
+EVALUATIONS = 12
 
 
 class RandomColumns:
@@ -138,7 +140,7 @@ class Likelihood:
         return white, np.asarray(taken)
 
 
-def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, steps: int = 12) -> Rest:
+def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest) -> Rest:
     """Return the rest with which data are most probable, given what effects may add.
 
     Parameters
@@ -151,8 +153,6 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, st
         What effects without a free amplitude add, µm.
     start : Rest
         Where to begin; its own error is kept.
-    steps : int
-        Most evaluations of the gradient.
     """
     unit = dataclasses.replace(start, start_um=1.0, fast_um=1.0)
     table = np.asfortranarray(np.column_stack([points.residual - fixed, points.random(unit), columns]))
@@ -182,7 +182,7 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, st
         return here + 0.5 * float(off @ off), (slopes + off / REST_FOLDS)[searched]
 
     bounds = [(t - FURTHEST, t + FURTHEST) for t in points.typical_logs[searched].tolist()]
-    options = {"maxfun": steps, "ftol": 1e-5}
+    options = {"maxfun": EVALUATIONS, "ftol": 1e-5}
     found = minimize(with_gradient, at[searched], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     at[searched] = found.x
     return start.with_logs(at)
