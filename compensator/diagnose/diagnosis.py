@@ -35,7 +35,7 @@ from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.refitted_paths import with_paths
-from compensator.diagnose.search import Candidate
+from compensator.diagnose.search import Alternative
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
 from compensator.errors import DataError
@@ -305,7 +305,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
         is_left_in = term is found.left_in
         signal = found.left_in_um if is_left_in else found.responses[i]
 
-        def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
+        def test(rival: Alternative, first: Term = term) -> PlannedTest | None:
             return deciding.best(selection.fit, rival.fit, (first.label, rival.term.label))
 
         effect = described(term, std, signal, evidence)

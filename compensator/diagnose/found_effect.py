@@ -14,7 +14,7 @@ from compensator.axes import FIRST
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
-from compensator.diagnose.search import Candidate
+from compensator.diagnose.search import Alternative
 from compensator.model.effects import Effect
 from compensator.model.effects.base import filters
 from compensator.model.effects.delay import CORRECTED
@@ -250,9 +250,9 @@ def no_further_than_seen(remainder: Regression, evidence: Evidence) -> Regressio
 
 def rivals_of(
     term: Term,
-    others: Iterable[Candidate],
+    others: Iterable[Alternative],
     chosen: tuple[float, float],
-    test: Callable[[Candidate], PlannedTest | None],
+    test: Callable[[Alternative], PlannedTest | None],
 ) -> tuple[Rival, ...]:
     """Return the best of other explanations, one for each place, that leave nearly as little as an effect.
 
@@ -260,7 +260,7 @@ def rivals_of(
     ----------
     term : Term
         The effect.
-    others : iterable of Candidate
+    others : iterable of Alternative
         Other explanations, best first.
     chosen : (float, float)
         What the effect leaves, µm rms, as it is known of the others, and its score.

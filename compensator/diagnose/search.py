@@ -40,7 +40,7 @@ OF_PATHS = ("dynamics", "gain", "delay")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
+class Alternative:
     """A hypothesis that was fitted in the place of an effect.
 
     Parameters
@@ -69,7 +69,7 @@ class Selection:
     ----------
     before, fit : Fit
         The fit of nothing, and of the effects found.
-    rivals : tuple of tuple of Candidate
+    rivals : tuple of tuple of Alternative
         For each effect, what else was fitted in its place, best first.
     undecided : tuple of Fit
         Where few values do not decide: effects that may act, best first.
@@ -77,7 +77,7 @@ class Selection:
 
     before: Fit
     fit: Fit
-    rivals: tuple[tuple[Candidate, ...], ...] = ()
+    rivals: tuple[tuple[Alternative, ...], ...] = ()
     undecided: tuple[Fit, ...] = ()
 
 
@@ -329,15 +329,15 @@ class Search:
                             return simple
         return fit
 
-    def _rivals(self, fit: Fit, index: int) -> tuple[Candidate, ...]:
+    def _rivals(self, fit: Fit, index: int) -> tuple[Alternative, ...]:
         """Return what else explains the part of an effect, one for each place, best first."""
         kept = fit.starts(index)
         base = fit_terms(fit.likelihood, kept, evaluations=1)
-        found: dict[Place, Candidate] = {}
+        found: dict[Place, Alternative] = {}
         for hypothesis, values in self._scan.ranked(fit.rest, base, self.criterion.cost_of):
             if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
-                found[hypothesis.place] = Candidate(
+                found[hypothesis.place] = Alternative(
                     term=other.terms[-1],
                     fit=other,
                     rms_um=self.criterion.compared(other),

@@ -16,7 +16,7 @@ from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
 from compensator.identify.arx import free_run_rms
-from compensator.identify.choice import Candidate
+from compensator.identify.choice import TriedStructure
 from compensator.identify.deformation import DeformationFit, PathFit, fit_deformation
 from compensator.identify.output_error import OutputErrorFit
 from compensator.identify.settings import Settings
@@ -274,7 +274,7 @@ def calibrate(
     )
 
 
-def with_deformation(calibration: Calibration, result: OutputErrorFit, candidate: Candidate) -> Calibration:
+def with_deformation(calibration: Calibration, result: OutputErrorFit, candidate: TriedStructure) -> Calibration:
     """Return a calibration with another fit of the deformation, that with the time constants of several axes.
 
     Parameters
@@ -283,7 +283,7 @@ def with_deformation(calibration: Calibration, result: OutputErrorFit, candidate
         The calibration of the axis alone.
     result : OutputErrorFit
         The other fit of the same data.
-    candidate : Candidate
+    candidate : TriedStructure
         Its structure and errors on held-out blocks.
     """
     before, old = calibration.deformation, calibration.model

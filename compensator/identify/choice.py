@@ -33,8 +33,8 @@ SEEN = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
-    """A structure and its held-out error.
+class TriedStructure:
+    """A structure that was tried, and its held-out error.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def held_out_errors(fit: OutputErrorFit, segments: Sequence[Segment], part: Sequ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tried:
+class FitWithFolds:
     """A structure fitted to everything and, fold by fold, to the rest.
 
     Parameters
@@ -146,7 +146,7 @@ class Tried:
         return tuple(float(np.sqrt(np.mean(e**2))) for e in self.errors)
 
 
-def tried(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Tried:
+def fit_with_folds(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> FitWithFolds:
     """Fit a structure to everything, and to all but one fold after another."""
     whole = fit(segments, structure, period_s)
     errors, seen = [], []
@@ -157,7 +157,7 @@ def tried(segments: Sequence[Segment], structure: Structure, period_s: float, fo
         if found.size:
             errors.append(found)
             seen.append(tuple(sees_start(segments, part, i) for i in range(len(segments))))
-    return Tried(structure=structure, whole=whole, errors=tuple(errors), sees_start=tuple(seen))
+    return FitWithFolds(structure=structure, whole=whole, errors=tuple(errors), sees_start=tuple(seen))
 
 
 def choose(
@@ -166,9 +166,9 @@ def choose(
     *,
     period_s: float,
     folds: int,
-    known: Tried | None = None,
+    known: FitWithFolds | None = None,
     progress: Progress = unreported,
-) -> tuple[list[Candidate], OutputErrorFit]:
+) -> tuple[list[TriedStructure], OutputErrorFit]:
     """Evaluate structures on folds and mark the chosen one.
 
     Parameters
@@ -181,14 +181,14 @@ def choose(
         Sample period, s.
     folds : int
         Number of blocks.
-    known : Tried, optional
+    known : FitWithFolds, optional
         A structure that was tried on these data before.
     progress : callable
         Called with the number of structures done and their total.
 
     Returns
     -------
-    list of Candidate
+    list of TriedStructure
         In the order given, one of them chosen.
     OutputErrorFit
         Its fit to everything.
@@ -198,16 +198,16 @@ def choose(
     DataError
         If the data is too short for every candidate.
     """
-    candidates: list[Candidate] = []
+    candidates: list[TriedStructure] = []
     fits: dict[Structure, OutputErrorFit] = {}
     before = {known.structure: known} if known is not None else {}
     for done, structure in enumerate(structures):
         progress(done, len(structures))
         try:
-            found = before.get(structure) or tried(segments, structure, period_s, folds)
+            found = before.get(structure) or fit_with_folds(segments, structure, period_s, folds)
         except DataError:
             continue
-        candidates.append(_candidate(segments, found))
+        candidates.append(_tried_structure(segments, found))
         fits[structure] = found.whole
     if not candidates:
         raise DataError(f"too little data for the smallest structure ({structures[0]})")
@@ -225,7 +225,7 @@ def choose(
     return [dataclasses.replace(c, chosen=c is winner) for c in candidates], fits[winner.structure]
 
 
-def _with_information(candidates: Sequence[Candidate], count: int, noise: float) -> list[Candidate]:
+def _with_information(candidates: Sequence[TriedStructure], count: int, noise: float) -> list[TriedStructure]:
     """Return candidates with Akaike's criterion, corrected for few values."""
     # A noise that was stated too small must not ask for more and more parameters.
     variance = max(noise**2, min(c.squares / (count - c.parameters) for c in candidates))
@@ -237,9 +237,9 @@ def _with_information(candidates: Sequence[Candidate], count: int, noise: float)
     ]
 
 
-def _candidate(segments: Sequence[Segment], found: Tried) -> Candidate:
+def _tried_structure(segments: Sequence[Segment], found: FitWithFolds) -> TriedStructure:
     structure, whole = found.structure, found.whole
-    return Candidate(
+    return TriedStructure(
         structure=structure,
         rms=float(np.sqrt(np.mean(np.concatenate(found.errors) ** 2))),
         fold_rms=found.fold_rms,

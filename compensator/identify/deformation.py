@@ -20,7 +20,7 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
 from compensator.errors import DataError
-from compensator.identify.choice import Candidate, Tried, choose
+from compensator.identify.choice import FitWithFolds, TriedStructure, choose
 from compensator.identify.output_error import OutputErrorFit, Prior, Segment, Structure
 from compensator.identify.rest import settle_starts
 from compensator.identify.settings import Settings
@@ -71,9 +71,9 @@ class DeformationFit:
         The two paths.
     segments : tuple of Segment
         Data of the DTF's fit, one for each run.
-    candidates : tuple of Candidate
+    candidates : tuple of TriedStructure
         Structures considered for the DTF (and TDTF, in method IV).
-    etve_candidates : tuple of Candidate
+    etve_candidates : tuple of TriedStructure
         Structures considered for the TDTF on the ETVE.
     remarks : tuple of str
         Remarks for the engineer.
@@ -82,8 +82,8 @@ class DeformationFit:
     dtf: PathFit
     tdtf: PathFit
     segments: tuple[Segment, ...]
-    candidates: tuple[Candidate, ...]
-    etve_candidates: tuple[Candidate, ...] = ()
+    candidates: tuple[TriedStructure, ...]
+    etve_candidates: tuple[TriedStructure, ...] = ()
     remarks: tuple[str, ...] = ()
 
     @property
@@ -130,7 +130,7 @@ def fit_deformation(
     prior = _prior(runs, used, drives)
     if settings.method == "IV":
         return _together(runs, used, drives, settings, period_s, prior, progress)
-    etve_candidates: tuple[Candidate, ...] = ()
+    etve_candidates: tuple[TriedStructure, ...] = ()
     if settings.method == "I":
         assert settings.given_tdtf is not None
         tdtf = _given(settings.given_tdtf, period_s)
@@ -200,7 +200,7 @@ def _prior(runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector]) 
 
 def _chosen(
     data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, progress: Progress
-) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
+) -> tuple[list[Segment], list[TriedStructure], OutputErrorFit]:
     """Determine how the runs start, choose a structure on the held-out blocks and fit it to all data."""
     segments, known = _settled(data, structures[: len(structures) // 2 + 1], settings.folds, period_s)
     candidates, result = choose(
@@ -211,7 +211,7 @@ def _chosen(
 
 def _settled(
     data: Sequence[Segment], structures: Sequence[Structure], folds: int, period_s: float
-) -> tuple[list[Segment], Tried]:
+) -> tuple[list[Segment], FitWithFolds]:
     """Determine how the runs start with the largest structure for which the data are enough."""
     for structure in reversed(structures[1:]):
         with suppress(DataError):
@@ -227,7 +227,7 @@ def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:
 
 def _from_etve(
     etve: Sequence[Run], settings: Settings, period_s: float, progress: Progress
-) -> tuple[PathFit, tuple[Candidate, ...]]:
+) -> tuple[PathFit, tuple[TriedStructure, ...]]:
     if not etve:
         raise DataError(
             f"method {settings.method} needs an ETVE (a run with all heat sources off), expected --etve DATA"

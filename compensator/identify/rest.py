@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Sequence
 from itertools import compress
 
-from compensator.identify.choice import Tried, no_worse, tried
+from compensator.identify.choice import FitWithFolds, fit_with_folds, no_worse
 from compensator.identify.output_error import Segment, Structure
 
 
 def settle_starts(
     segments: Sequence[Segment], structure: Structure, period_s: float, folds: int
-) -> tuple[list[Segment], Tried]:
+) -> tuple[list[Segment], FitWithFolds]:
     """Mark the segments whose start from rest the data do not contradict.
 
     Segment by segment, a start from rest is kept if it increases the free-run error on held-out blocks over that of a
@@ -34,14 +34,14 @@ def settle_starts(
     -------
     list of Segment
         The same data, with `rest` set for these segments.
-    Tried
+    FitWithFolds
         The structure on them.
     """
     kept = [dataclasses.replace(segment, rest=False) for segment in segments]
-    free = tried(kept, structure, period_s, folds)
+    free = fit_with_folds(kept, structure, period_s, folds)
     for i, segment in enumerate(kept):
         trial = [*kept[:i], dataclasses.replace(segment, rest=True), *kept[i + 1 :]]
-        fixed = tried(trial, structure, period_s, folds)
+        fixed = fit_with_folds(trial, structure, period_s, folds)
         # A block that hides how it began says nothing of that.
         judges = [each[i] for each in free.sees_start]
         fixed_rms, free_rms = (list(compress(one.fold_rms, judges)) for one in (fixed, free))

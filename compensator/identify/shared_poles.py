@@ -22,7 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.calibration import Calibration, with_deformation
-from compensator.identify.choice import Candidate, folds_of, held_out_errors, is_supported
+from compensator.identify.choice import TriedStructure, folds_of, held_out_errors, is_supported
 from compensator.identify.output_error import (
     OutputErrorFit,
     Segment,
@@ -48,13 +48,13 @@ class Output:
         Data of the fit.
     fit : OutputErrorFit
         The fit of the axis alone.
-    alone : Candidate
+    alone : TriedStructure
         Its structure with its errors on held-out blocks.
     """
 
     segments: tuple[Segment, ...]
     fit: OutputErrorFit
-    alone: Candidate
+    alone: TriedStructure
 
     @property
     def weight(self) -> float:
@@ -70,12 +70,12 @@ class Shared:
     ----------
     fits : dict of str to OutputErrorFit
         Fit of each axis, with the common poles.
-    candidates : dict of str to Candidate
+    candidates : dict of str to TriedStructure
         Structure and errors on held-out blocks of each axis.
     """
 
     fits: Mapping[str, OutputErrorFit]
-    candidates: Mapping[str, Candidate]
+    candidates: Mapping[str, TriedStructure]
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -241,7 +241,7 @@ def _shared(outputs: Mapping[str, Output], period_s: float, folds: int) -> Share
     return max(agreeing, key=lambda one: _gain(one, outputs), default=None)
 
 
-def _agrees(together: Candidate, alone: Candidate) -> bool:
+def _agrees(together: TriedStructure, alone: TriedStructure) -> bool:
     """Whether the data of an axis permit the common time constants."""
     return together.supported and together.rms <= (1.0 + NEGLIGIBLE) * alone.rms
 
@@ -264,7 +264,7 @@ def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: f
             own.append(held_out_errors(fit, one.segments, part))
     candidates = {}
     for axis, one, own, fit, kind in zip(outputs, each, errors, whole, structures, strict=True):
-        candidates[axis] = Candidate(
+        candidates[axis] = TriedStructure(
             structure=kind,
             rms=float(np.sqrt(np.mean(np.concatenate(own) ** 2))),
             fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in own if e.size),

@@ -11,7 +11,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.display import with_std
 from compensator.identify.calibration import Calibration, Part, joined
-from compensator.identify.choice import Candidate
+from compensator.identify.choice import TriedStructure
 from compensator.identify.comparison import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
 from compensator.identify.summary import (
@@ -246,7 +246,7 @@ def _choice(calibration: Calibration) -> Block:
     )
     sparse = any(run.has_sparse_y for run in calibration.runs)
 
-    def table(title: str, candidates: Sequence[Candidate]) -> Table:
+    def table(title: str, candidates: Sequence[TriedStructure]) -> Table:
         return Table(
             title=title,
             head=["structure", "held-out rms, µm", "worst block, µm", ""],
