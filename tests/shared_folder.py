@@ -44,12 +44,12 @@ def search_once(patch: pytest.MonkeyPatch, factory: pytest.TempPathFactory) -> N
 
     find = diagnosis.find_effects
 
-    def once(model: Any, runs: Any, **settings: Any) -> Any:
+    def once(model: Any, runs: Any, options: Any, **report: Any) -> Any:
         def search(folder: Path) -> None:
-            found = find(model, runs, **settings)
+            found = find(model, runs, options, **report)
             (folder / "found").write_bytes(pickle.dumps((found, found.model is model)))
 
-        asked = hashlib.sha256(pickle.dumps((model, runs, sorted(settings["expected"])))).hexdigest()
+        asked = hashlib.sha256(pickle.dumps((model, runs, sorted(options.expected)))).hexdigest()
         answer = made_once(factory, f"searched-{asked}", search) / "found"
         found, is_same = pickle.loads(answer.read_bytes())
         return dataclasses.replace(found, model=model) if is_same else found

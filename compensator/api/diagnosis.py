@@ -34,6 +34,7 @@ from compensator.data.measurement import (
 )
 from compensator.data.screening import require_y_noise
 from compensator.diagnose.across import MachineEffect, across, missing_places
+from compensator.diagnose.diagnosis import DiagnosisOptions
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
@@ -389,16 +390,18 @@ def diagnose(
     ) -> DiagnosisResult:
         words = words_of(one, given, validation, models=[bases[one].name])
         with words.errors():
-            return _diagnosed(
+            return _diagnose_axis(
                 bases[one],
                 of_axis(given, one),
                 of_axis(validation, one),
                 words,
+                DiagnosisOptions(
+                    expected=expected,
+                    keep_paths=keep_paths,
+                    all_data=all_data or fit_until_h is not None or len(axes) > 1,
+                ),
                 fit_until_h=fit_until_h,
                 y_std_um=y_std_um,
-                expected=expected,
-                keep_paths=keep_paths,
-                all_data=all_data or fit_until_h is not None or len(axes) > 1,
                 progress=lambda done, steps: report(number * steps + done, of * steps),
                 executor_map=executor_map if executor else map,
             )
@@ -413,25 +416,29 @@ def diagnose(
     results = {one: dataclasses.replace(result, model=models[one]) for one, result in results.items()}
     if len(results) == 1:
         return next(iter(results.values()))
-    names = [one for one in axes if all(column_of(one) in each.table.columns for each in given)]
-    records = [record for each in given for record in each.at_period(bases[axes[0]].period_s).records]
+    return DiagnosedAxes(results=results, machine=_machine(results, given, bases[axes[0]].period_s))
+
+
+def _machine(
+    results: Mapping[str, DiagnosisResult], given: Sequence[Measurement], period_s: float
+) -> tuple[MachineEffect, ...]:
+    """Return every effect with what it moves on each axis."""
+    names = [one for one in results if all(column_of(one) in each.table.columns for each in given)]
+    records = [record for each in given for record in each.at_period(period_s).records]
     values = {one: [record.columns[column_of(one)] for record in records] for one in names}
-    partners = {a: b for pair in pairs(values, bases[axes[0]].period_s) for a, b in pair.both_ways}
-    found = across({one: result.diagnosis for one, result in results.items()}, partners)
-    return DiagnosedAxes(results=results, machine=found)
+    partners = {a: b for pair in pairs(values, period_s) for a, b in pair.both_ways}
+    return across({one: result.diagnosis for one, result in results.items()}, partners)
 
 
-def _diagnosed(
+def _diagnose_axis(
     base: ThermalModel,
     given: Sequence[Measurement],
     validation: Sequence[Measurement],
     words: AxisWords,
+    options: DiagnosisOptions,
     *,
     fit_until_h: float | None,
     y_std_um: float | None,
-    expected: frozenset[Place],
-    keep_paths: bool,
-    all_data: bool,
     progress: Progress,
     executor_map: ExecutorMap,
 ) -> DiagnosisResult:
@@ -444,16 +451,8 @@ def _diagnosed(
     require_y_noise(name_of(runs), runs)
     for one in validation:  # refused before the search, which may take minutes
         remarks += screened([one])[1]
-    found = find_effects(
-        base,
-        runs,
-        expected=expected,
-        keep_paths=keep_paths,
-        unseen=_is_unseen(base, measured),
-        all_data=all_data,
-        progress=progress,
-        executor_map=executor_map,
-    )
+    options = dataclasses.replace(options, unseen=_is_unseen(base, measured))
+    found = find_effects(base, runs, options, progress=progress, executor_map=executor_map)
     if words.axis != FIRST:
         effects = tuple(dataclasses.replace(effect, axis=words.axis) for effect in found.effects)
         found = dataclasses.replace(found, effects=effects)
@@ -472,12 +471,11 @@ def _diagnosed(
             text = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
             remarks.append(Remark(DataRemark.NOT_VALIDATED, text))
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
-    shown = tuple(one for one in free_run if one.samples)
     return DiagnosisResult(
         model=extended,
         diagnosis=found,
         remarks=tuple(remarks),
-        free_run=shown,
+        free_run=tuple(one for one in free_run if one.samples),
         words=words,
         since_utc_s=measured[0].since_utc_s,
         sources=tuple(sources),

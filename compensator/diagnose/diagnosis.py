@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
-from compensator.diagnose.advice import advice_of
+from compensator.diagnose.advice import Advice, advice_of
 from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
@@ -30,7 +31,7 @@ from compensator.diagnose.found_effect import FoundEffect, described, no_further
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.noise import VERDICT_TIMES, is_far_off
+from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
@@ -46,25 +47,12 @@ from compensator.model.thermal_model import LEAST_OWN_ERROR, ThermalModel
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 
-def diagnose(
-    model: ThermalModel,
-    runs: Sequence[Run],
-    *,
-    expected: frozenset[Place] = frozenset(),
-    keep_paths: bool = False,
-    unseen: bool = False,
-    all_data: bool = False,
-    progress: Progress = unreported,
-    executor_map: ExecutorMap = map,
-) -> Diagnosis:
-    """Find what a model lacks.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnosisOptions:
+    """What is known of data and base beside themselves, and what is asked of their diagnosis.
 
     Parameters
     ----------
-    model : ThermalModel
-        The base model.
-    runs : sequence of Run
-        Measured data with y and every channel that was logged.
     expected : frozenset of Place
         Effects that another axis of the machine shows.
     keep_paths : bool
@@ -74,6 +62,36 @@ def diagnose(
         fitted anew, or they are kept.
     all_data : bool
         Whether all of the data are searched, also where an effect began within them (`onset`).
+    """
+
+    expected: frozenset[Place] = frozenset()
+    keep_paths: bool = False
+    unseen: bool = False
+    all_data: bool = False
+
+
+#: Those of a diagnosis of which nothing else is known or asked.
+DEFAULTS = DiagnosisOptions()
+
+
+def diagnose(
+    model: ThermalModel,
+    runs: Sequence[Run],
+    options: DiagnosisOptions = DEFAULTS,
+    *,
+    progress: Progress = unreported,
+    executor_map: ExecutorMap = map,
+) -> Diagnosis:
+    """Find what a model lacks: in all of the data, and where an effect began within them, in those since.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The base model.
+    runs : sequence of Run
+        Measured data with y and every channel that was logged.
+    options : DiagnosisOptions
+        What is asked.
     progress : callable
         Called with how many searches of how many are done.
     executor_map : callable
@@ -84,9 +102,6 @@ def diagnose(
     DataError
         If there is too little data.
     """
-    diagnosed = partial(
-        _diagnosed, model, expected=expected, keep_paths=keep_paths, unseen=unseen, executor_map=executor_map
-    )
     steps = 0
 
     def counted(done: int, total: int) -> None:
@@ -94,12 +109,13 @@ def diagnose(
         steps = total
         progress(done, total)
 
-    found = diagnosed(runs, progress=counted)
-    onset = None if all_data else onset_in(found)
+    found = _as_a_whole(model, runs, options, counted, executor_map)
+    onset = None if options.all_data else onset_in(found)
     if onset is None:
         return found
+    kept = dataclasses.replace(options, keep_paths=True)
     try:
-        later = diagnosed([onset.run], keep_paths=True, progress=after(progress, steps))
+        later = _as_a_whole(model, [onset.run], kept, after(progress, steps), executor_map)
     except DataError:  # too little data since then
         return found
     if not explains_better(later, found):
@@ -107,23 +123,59 @@ def diagnose(
     return dataclasses.replace(later, since_h=onset.since_h, warnings=(onset.remark, *later.warnings))
 
 
-def _diagnosed(
+def _as_a_whole(
     model: ThermalModel,
     runs: Sequence[Run],
-    *,
-    expected: frozenset[Place],
-    keep_paths: bool,
-    unseen: bool,
+    options: DiagnosisOptions,
     progress: Progress,
     executor_map: ExecutorMap,
-    is_off: bool = False,
 ) -> Diagnosis:
-    """Diagnose all of the data; see `diagnose`.
+    """Diagnose data as one: with paths fitted anew where the base is far off, unless nothing comes of that."""
+    searched = _searched(model, runs, options, progress, executor_map)
+    chosen = searched.chosen
+    if chosen.needs_known_paths or (options.unseen and chosen.base_foretells_better):
+        kept, progress = dataclasses.replace(options, keep_paths=True), after(progress, searched.searches)
+        searched = _searched(model, runs, kept, progress, executor_map, is_off=not options.unseen)
+    return _result(model, searched)
 
-    `is_off`: a search for paths fitted anew has given nothing that is deployed, so those of the base are kept. It is
-    far off all the same, and has seen the data: effects beside it have to show that they foretell them.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Searched:
+    """What was found in all of the data, and what of it is deployed.
+
+    Parameters
+    ----------
+    chosen : Deployment
+        Effects and remainder, their errors on held-out blocks, and what of them is deployed.
+    deciding : Deciding
+        The tests of the machine that may decide between explanations.
+    left_out : list of Remark
+        A remark on values that do not fit and took no part, if there are any.
+    searches : int
+        Number of searches: in all data, and without each block.
+    is_off : bool
+        Whether a search for paths fitted anew has given nothing that is deployed, so those of the base are kept. It is
+        far off all the same, and has seen the data.
     """
-    evidence_of_runs = partial(_evidence, model, expected=expected, keep_paths=keep_paths)
+
+    chosen: Deployment
+    deciding: Deciding
+    left_out: list[Remark]
+    searches: int
+    is_off: bool
+
+
+def _searched(
+    model: ThermalModel,
+    runs: Sequence[Run],
+    options: DiagnosisOptions,
+    progress: Progress,
+    executor_map: ExecutorMap,
+    *,
+    is_off: bool = False,
+) -> _Searched:
+    """Search all of the data and without each block, and choose what is deployed; `is_off` as in `_Searched`."""
+    evidence_of_runs = partial(_evidence, model, options=options)
     evidence = evidence_of_runs(runs)
     searches = 1 + len(list(evidence.blocks(FOLDS)))
     progress(0, searches)
@@ -137,19 +189,16 @@ def _diagnosed(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects if not effect.left_in]
     held_out = held_out_of(found, places, progress, executor_map)
+    # A base that is far off and has seen the data: effects beside it have to show that they foretell them.
     chosen = deployment_of(found, effects, held_out, contradicts=1.0 if is_off else CONTRADICTS)
+    return _Searched(chosen=chosen, deciding=deciding, left_out=left_out, searches=searches, is_off=is_off)
+
+
+def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
+    """Return the result: verdict, extended model, errors, advice and warnings."""
+    chosen, is_off = searched.chosen, searched.is_off
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
-    if chosen.needs_known_paths or (unseen and chosen.base_foretells_better):
-        return _diagnosed(
-            model,
-            runs,
-            expected=expected,
-            keep_paths=True,
-            unseen=False,
-            progress=after(progress, searches),
-            executor_map=executor_map,
-            is_off=not unseen,
-        )
+    evidence = found.search.evidence
     few = evidence.is_sparse
     extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
     deployed = extended is not model
@@ -169,12 +218,7 @@ def _diagnosed(
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
     advice = None
     if verdict != "adequate" or hides:
-        tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
-        tests += _between_undecided(found, deciding)
-        explained_pct = ceiling.explained_pct if ceiling else None
-        advice = advice_of(
-            found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained or hides
-        )
+        advice = _advice(searched, ceiling, is_explained=is_explained or hides)
     refused = _refused(chosen)
     left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
@@ -203,7 +247,12 @@ def _diagnosed(
         held_out_named=held_out.named,
         held_out_after=held_out.nothing if refused else held_out.whole,
         tried=_ranked(found, effects),
-        warnings=(*left_out, *remarks, *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off), *warnings),
+        warnings=(
+            *searched.left_out,
+            *remarks,
+            *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off),
+            *warnings,
+        ),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),
         ceiling=ceiling,
@@ -211,6 +260,15 @@ def _diagnosed(
         could_hide=could_hide,
         refused=refused,
     )
+
+
+def _advice(searched: _Searched, ceiling: Ceiling | None, *, is_explained: bool) -> Advice:
+    """Return what to measure and to test next."""
+    found, deciding = searched.chosen.found, searched.deciding
+    tests = [rival.test for effect in searched.chosen.effects for rival in effect.rivals if rival.test is not None]
+    tests += _between_undecided(found, deciding)
+    explained_pct = ceiling.explained_pct if ceiling else None
+    return advice_of(found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained)
 
 
 def _refused(chosen: Deployment) -> Refused | None:
@@ -248,21 +306,15 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
     )
 
 
-def _evidence(
-    model: ThermalModel, runs: Sequence[Run], *, expected: frozenset[Place] = frozenset(), keep_paths: bool = False
-) -> Evidence:
+def _evidence(model: ThermalModel, runs: Sequence[Run], options: DiagnosisOptions = DEFAULTS) -> Evidence:
     """Return the evidence of runs, with free paths where the model is far off, unless they are to be kept."""
-    evidence = dataclasses.replace(evidence_of(model, runs), expected=expected)
-    return evidence.with_free_paths() if _is_far_off(evidence) and not keep_paths else evidence
-
-
-def _is_far_off(evidence: Evidence) -> bool:
-    return is_far_off(evidence.model, evidence.noise.noise_um, evidence.spread_um)
+    evidence = dataclasses.replace(evidence_of(model, runs), expected=options.expected)
+    return evidence.with_free_paths() if evidence.is_far_off and not options.keep_paths else evidence
 
 
 def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off: bool) -> list[Remark]:
     """Return the remark that paths were kept which would be fitted anew, where something is missing."""
-    if verdict == "adequate" or (evidence.free_paths and deployed) or not _is_far_off(evidence):
+    if verdict == "adequate" or (evidence.free_paths and deployed) or not evidence.is_far_off:
         return []
     left_um = evidence.model.held_out_rms_um or 0.0
     why = "nothing came of paths fitted anew, so its own were kept" if is_off else "its paths were kept"
@@ -415,7 +467,7 @@ def _deviation_um(
         # small, the other has few blocks. What is open of the parameters the effects state by themselves.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
-    if not deploys and _is_far_off(evidence):
+    if not deploys and evidence.is_far_off:
         # What is learned beside paths, or an own error, that are not deployed says nothing of what the base leaves.
         left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
     # The engine states by itself what it cannot know of a late T_Q.

@@ -31,7 +31,7 @@ from compensator.diagnose.base_run import (
     without_noise,
 )
 from compensator.diagnose.no_causes import no_causes
-from compensator.diagnose.noise import NoiseTest, noise_floor, own_error
+from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error
 from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
@@ -126,6 +126,11 @@ class Evidence:
     def spread_um(self) -> float:
         """Standard deviation of the measured deformation, µm."""
         return float(np.nanstd(self.y_um))
+
+    @property
+    def is_far_off(self) -> bool:
+        """Whether the calibration of the base missed by more than is granted: its paths lack something."""
+        return is_far_off(self.model, self.noise.noise_um, self.spread_um)
 
     @property
     def deformation_um(self) -> Vector:

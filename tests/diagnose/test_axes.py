@@ -99,14 +99,14 @@ def test_progress_goes_on_where_an_axis_is_searched_once_more(files, monkeypatch
     class StopSearch(Exception):
         pass
 
-    def diagnosed(base, given, validation, words, *, expected, progress, **_):
+    def diagnosed(base, given, validation, words, options, *, progress, **_):
         progress(0, 4)
         progress(4, 4)
-        if expected:
+        if options.expected:
             raise StopSearch
         return SimpleNamespace(diagnosis=None)
 
-    monkeypatch.setattr(api_diagnosis, "_diagnosed", diagnosed)
+    monkeypatch.setattr(api_diagnosis, "_diagnose_axis", diagnosed)
     monkeypatch.setattr(api_diagnosis, "missing_places", lambda _: {"x": frozenset({PLACE})})
     with pytest.raises(StopSearch):
         tc.diagnose(*files, progress=lambda done, total: told.append((done, total)))

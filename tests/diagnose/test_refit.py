@@ -11,7 +11,7 @@ from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.background import LAGS_MIN, Background
-from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of, in_free_run
 from compensator.diagnose.outcome import rms_of
@@ -116,7 +116,7 @@ def test_the_extended_model_says_what_error_it_has_left(found):
 
 
 def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(model, runs, found):
-    kept = diagnose(model, runs, keep_paths=True)
+    kept = diagnose(model, runs, DiagnosisOptions(keep_paths=True))
     assert (kept.model.dtf, kept.model.tdtf) == (model.dtf, model.tdtf) and found.model.dtf != model.dtf
     assert [e.place for e in kept.effects][:1] == [("input", "", "spindle_rpm")]
     codes = [one.code for one in kept.warnings]
@@ -191,7 +191,8 @@ def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, 
         monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
         asked.clear()
         reported = []
-        again = diagnose(model, runs, unseen=True, progress=lambda *steps, reported=reported: reported.append(steps))
+        options = DiagnosisOptions(unseen=True)
+        again = diagnose(model, runs, options, progress=lambda *steps, reported=reported: reported.append(steps))
         assert (again.model.dtf == model.dtf) is kept
         again_steps = [(4, 8), (5, 8), (6, 8), (7, 8), (8, 8)] if kept else []
         assert reported == [(0, 4), (4, 4), *again_steps]
