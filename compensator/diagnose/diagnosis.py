@@ -7,14 +7,13 @@ it, and what that finds is applied to the block.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Vector, rms_of
+from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import Advice, advice_of
@@ -22,28 +21,25 @@ from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of, is_adequate
+from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.findings import Findings, findings_of, in_free_run
-from compensator.diagnose.fit import Term, fit_terms
-from compensator.diagnose.found_effect import FoundEffect, described, no_further_than_seen, rivals_of, seen_of
+from compensator.diagnose.extended_model import extended_model
+from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.diagnose.named_effects import named_effects, ranked
 from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
 from compensator.diagnose.points import Points
-from compensator.diagnose.refitted_paths import with_paths
-from compensator.diagnose.search import Alternative
-from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
+from compensator.diagnose.verdict import ceiling_of, judged
 from compensator.errors import DataError
-from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
-from compensator.model.late_observer import late_variance_um2
-from compensator.model.thermal_model import LEAST_OWN_ERROR, ThermalModel
+from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 
@@ -185,7 +181,7 @@ def _searched(
     found = _as_begun(found)
     evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
-    effects = _effects(found, deciding)
+    effects = named_effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects if not effect.left_in]
     held_out = held_out_of(found, places, progress, executor_map)
@@ -200,19 +196,10 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     evidence = found.search.evidence
     few = evidence.is_sparse
-    extended, remarks = (model, ()) if chosen.is_refused else _extended(model, found, effects)
+    extended, remarks = extended_model(model, chosen)
     deployed = extended is not model
-    deviation_um = _deviation_um(extended, model, found, effects, held_out)
-    if deployed:
-        extended = dataclasses.replace(extended, y_std_um=deviation_um, sha256="")
-    else:
-        remarks = tuple(_deviation_contradicted(model.y_std_um, deviation_um))
-    ceiling = _ceiling(held_out)
-    verdict, is_explained = _verdict(
-        found, effects, held_out, extended, holds_in_free_run=chosen.worse_um is None, is_off=is_off
-    )
-    if verdict == "explained" and ceiling is not None and ceiling.is_missed(rms_of(held_out.nothing)):
-        verdict = "partly_explained"
+    ceiling = ceiling_of(held_out)
+    verdict, is_explained = judged(chosen, extended, ceiling, is_off=is_off)
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
@@ -246,7 +233,7 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
         held_out_after=held_out.nothing if refused else held_out.whole,
-        tried=_ranked(found, effects),
+        tried=ranked(found, effects),
         warnings=(
             *searched.left_out,
             *remarks,
@@ -334,226 +321,3 @@ def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]
     second = next((fit for fit in undecided if fit.places != first.places), found.selection.fit)
     test = deciding.best(first, second, (first.terms[-1].label, second.terms[-1].label if second.terms else "nothing"))
     return [test] if test is not None else []
-
-
-def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
-    """Return the named effects, that which removes most first."""
-    evidence, search = found.search.evidence, found.search
-    selection = found.selection
-
-    def rms_without(responses: Sequence[Vector]) -> float:
-        # Paths that were fitted anew stay as they are.
-        left = evidence.residual - sum(responses, found.own_paths)
-        return rms_of(evidence.without_nuisances(np.where(evidence.used, left, 0.0))[evidence.used])
-
-    after = rms_without(found.responses)
-    chosen = search.criterion.compared(selection.fit), search.criterion.score(selection.fit)
-    effects = []
-    errors = _errors(found)
-    few = evidence.is_sparse
-    if few:
-        errors = with_time_errors(found.fit, errors)
-    for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
-        is_left_in = term is found.left_in
-        signal = found.left_in_um if is_left_in else found.responses[i]
-
-        def test(rival: Alternative, first: Term = term) -> PlannedTest | None:
-            return deciding.best(selection.fit, rival.fit, (first.label, rival.term.label))
-
-        effect = described(term, std, signal, evidence)
-        if few:
-            words = effect.explanation + time_words(std, search.points.period_min)
-            effect = dataclasses.replace(effect, explanation=words)
-        effects.append(
-            FoundEffect(
-                term=term,
-                effect=effect,
-                rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
-                rms_after_um=rms_without([*found.responses, signal]) if is_left_in else after,
-                signal=signal,
-                rivals=rivals_of(term, rivals, chosen, test),
-                replaced=not found.deploys_names,
-                left_in=is_left_in,
-            )
-        )
-    return tuple(sorted(effects, key=lambda effect: -effect.rms_before_um))
-
-
-def _errors(found: Findings) -> list[dict[str, float]]:
-    """Return the standard errors of each term.
-
-    Beside a late T_Q that is left in, the others are fitted to what it leaves, too: by how much that moves them counts.
-    """
-    if found.left_in is None:
-        return standard_errors(found.fit)
-    corrected, others = found.selection.fit, iter(standard_errors(found.fit))
-    return [
-        std
-        if term is found.left_in
-        else {name: math.hypot(std, term.named[name] - then.named[name]) for name, std in next(others).items()}
-        for term, then, std in zip(found.terms, corrected.terms, standard_errors(corrected), strict=True)
-    ]
-
-
-def _extended(
-    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]
-) -> tuple[ThermalModel, tuple[Remark, ...]]:
-    """Return the model with every effect that can be deployed and the remainder; the model itself without any."""
-    evidence = found.search.evidence
-    deployed = _with_factors(model, found, [effect for effect in effects if effect.deployable])
-    remarks: tuple[Remark, ...] = ()
-    base, remainder = model, found.remainder.effect if found.remainder else None
-    if found.refitted:
-        base, remainder = with_paths(model, remainder or found.refitted.effect)
-        base = dataclasses.replace(base, held_out_rms_um=None)
-        remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
-    if remainder is not None:
-        seen = seen_of(remainder, found.whole - found.named, evidence)
-        if not found.refitted:
-            # Paths that were fitted anew together with it may go further, too, and the two share what both explain.
-            remainder = no_further_than_seen(remainder, evidence)
-        deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(seen)))
-    if not deployed and base is model:
-        return model, ()
-    return dataclasses.replace(base, effects=(*model.effects, *deployed), sha256=""), remarks
-
-
-def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]) -> list[Effect]:
-    """Return effects with what the data leave open of all their parameters together.
-
-    Where the base's paths were fitted anew with them, none is stated: what the paths make up for is not known apart.
-    """
-    if found.refitted or not effects:
-        return [effect.effect for effect in effects]
-    terms = [term for term in found.terms if term is not found.left_in]
-    factors = std_factors(found.fit, terms, beside_own_error=found.is_own_error)
-    rows = dict(zip(map(id, terms), factors, strict=True))
-    # Rows belong together by their place: those of effects that the model has already come first.
-    before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
-    return [
-        effect.effect
-        if effect.effect.lateness
-        else dataclasses.replace(effect.effect, std_factor=((),) * before + rows[id(effect.term)])
-        for effect in effects
-    ]
-
-
-def _deviation_contradicted(stated_um: float, shown_um: float) -> Iterator[Remark]:
-    """Yield a remark where a model to which nothing is added states a smaller deviation than the data show."""
-    if shown_um > VERDICT_TIMES * stated_um:
-        text = (
-            f"The model states {stated_um:.2f} µm as the standard deviation of its own error; these data show "
-            f"{shown_um:.2f} µm. It was left as it is."
-        )
-        yield Remark(ModelWarning.DEVIATION_CONTRADICTED, text)
-
-
-def _deviation_um(
-    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
-) -> float:
-    """Return the standard deviation of a model's own error that the data show, µm."""
-    evidence, deploys = found.search.evidence, extended is not model
-    # What depends on time alone is an error of the measurement: it is not in the machine that the model runs on.
-    of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
-    kept_out = [
-        effect.signal[evidence.used]
-        for effect in of_machine
-        if effect.left_in or not (deploys and (effect.effect.deployable or effect.replaced))
-    ]
-    left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
-    is_approximate = found.refitted is not None or not found.search.points.is_exact
-    if deploys and is_approximate and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
-        # No effect has exactly this form: half what the fit expects, half what held-out blocks show. The one is too
-        # small, the other has few blocks. What is open of the parameters the effects state by themselves.
-        shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
-        left = 0.5 * (left + shown)
-    if not deploys and evidence.is_far_off:
-        # What is learned beside paths, or an own error, that are not deployed says nothing of what the base leaves.
-        left = max(left, in_free_run(found)[0] ** 2 - evidence.noise.noise_um**2)
-    # The engine states by itself what it cannot know of a late T_Q.
-    late = late_variance_um2(extended) - late_variance_um2(model)
-    return float(np.sqrt(max(left - late, (LEAST_OWN_ERROR * evidence.noise.noise_um) ** 2)))
-
-
-def _refitted(old: ThermalModel, new: ThermalModel) -> str:
-    paths = [("DTF", old.dtf, new.dtf), *([("TDTF", old.tdtf, new.tdtf)] if old.tdtf and new.tdtf else [])]
-    gains = ", ".join(
-        f"{name} from {a.sampled.dc_gain:.3g} to {b.sampled.dc_gain:.3g} {a.unit.replace('um', 'µm')}"
-        for name, a, b in paths
-    )
-    return (
-        "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
-        f"together with it; gains changed: {gains}."
-    )
-
-
-def _ceiling(held_out: HeldOut) -> Ceiling | None:
-    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
-    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
-    if linear >= before:
-        return None
-    return Ceiling(
-        rms_um=float(np.sqrt(linear)),
-        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
-        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
-    )
-
-
-def _ranked(found: Findings, effects: Sequence[FoundEffect]) -> tuple[tuple[str, float], ...]:
-    """Return what was tried in place of the largest effect, and that, with what each leaves."""
-    if not effects:
-        return ()
-    largest, selected = effects[0].place, found.selection.fit
-    at = next(i for i, term in enumerate(selected.terms) if term.hypothesis.place == largest)
-    best = {selected.terms[at].hypothesis.label: found.search.criterion.compared(selected)}
-    for candidate in found.selection.rivals[at]:
-        label = candidate.term.hypothesis.label
-        best[label] = min(candidate.rms_um, best.get(label, np.inf))
-    return tuple(sorted(best.items(), key=lambda item: item[1]))
-
-
-def _verdict(
-    found: Findings,
-    effects: Sequence[FoundEffect],
-    held_out: HeldOut,
-    extended: ThermalModel,
-    *,
-    holds_in_free_run: bool,
-    is_off: bool,
-) -> tuple[Verdict, bool]:
-    """Return the verdict in one word, and whether nothing is left to look for.
-
-    "Explained" is said of the named effects alone; what the remainder corrects beside them is not looked for, but has
-    no name. What the engine cannot know of a late T_Q counts as noise.
-    """
-    evidence = found.search.evidence
-    observed = [term.hypothesis.effect.observed for term in found.terms]
-    unknown_um2 = late_variance_um2(extended)
-    noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
-
-    def leaves_noise(added: Vector) -> bool:
-        left = evidence.left(added)[evidence.used]
-        return noise.is_explained(float(left @ left))
-
-    is_noise = leaves_noise(found.whole + found.left_in_um)
-    if not observed:
-        if is_adequate(found, held_out) and not is_off:
-            return "adequate", False
-        # Noise in the fit, and more on held-out blocks: in the residual is nothing to look for.
-        return "unexplained", found.remainder is None and not evidence.free_paths and found.leaves_noise
-    if not any(observed):
-        return "unexplained", False
-
-    most_um2 = rms_of(held_out.nothing) ** 2
-    if evidence.is_sparse:
-        # What few values were fitted by must hold on those that it was not fitted to.
-        most_um2 = min(most_um2, VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count))
-
-    def holds(values: Vector) -> bool:
-        return rms_of(values) ** 2 < most_um2
-
-    nothing_left = is_noise and holds(held_out.whole) and all(observed) and found.deploys_names and holds_in_free_run
-    by_names = (
-        leaves_noise(found.named + found.left_in_um) and holds(held_out.named) and all(e.is_determined for e in effects)
-    )
-    return ("explained" if nothing_left and by_names else "partly_explained"), nothing_left

@@ -13,6 +13,7 @@ from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.background import LAGS_MIN, Background
 from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
 from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.extended_model import with_effects
 from compensator.diagnose.findings import findings_of, in_free_run
 from compensator.diagnose.outcome import rms_of
 from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
@@ -161,7 +162,7 @@ def test_beside_paths_that_were_fitted_anew_the_remainder_has_no_limit(model, se
     searched = searches["findings_of"][0]
     searched = dataclasses.replace(searched, remainder=searched.channels)
     for refitted, is_limited in ((searched.refitted, False), (None, True)):
-        extended, _ = diagnosis_module._extended(model, dataclasses.replace(searched, refitted=refitted), ())
+        extended, _ = with_effects(model, dataclasses.replace(searched, refitted=refitted), ())
         (rest,) = extended.effects
         assert rest.kind == "regression" and np.isfinite(rest.most_um) == is_limited
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from compensator.diagnose.ceiling import ceiling, explained, remainder
-from compensator.diagnose.diagnosis import _ceiling
 from compensator.diagnose.found_effect import FoundEffect, rivals_of
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import headline
+from compensator.diagnose.verdict import ceiling_of
 from compensator.report.diagnosis import tone_of
 from tests.diagnose.scenarios import held_out_errors
 
@@ -144,7 +144,7 @@ def test_a_remainder_that_increases_the_held_out_error_says_so_and_why_it_is_dep
 def test_no_error_is_below_the_ceiling(named: float, whole: float, best: float) -> None:
     one = np.ones(9)
     held_out = held_out_errors(9.0 * one, named=named * one, whole=whole * one, ceiling=4.82 * one)
-    top = _ceiling(held_out)
+    top = ceiling_of(held_out)
     assert top is not None and top.rms_um == pytest.approx(4.82) and top.least_um == pytest.approx(best)
     assert top.explained_pct == pytest.approx(min(100.0 * (81.0 - named**2) / (81.0 - 4.82**2), 100.0))
     table = found(
