@@ -17,7 +17,7 @@ from compensator.axes import label_of
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, response, settled
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.likelihood import Likelihood, learned_rest
+from compensator.diagnose.likelihood import Likelihood, rest_without_effects
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.points import Points
 from compensator.diagnose.standard_errors import deviations
@@ -173,9 +173,7 @@ def _share(axis: str, diagnosis: Diagnosis, effect: FoundEffect, reference: Foun
 
 
 def _fitted(points: Points, starts: list[Start]) -> Fit:
-    nothing = np.zeros(points.count)
-    rest = learned_rest(points, np.zeros((points.count, 0)), nothing, points.typical_rest())
-    return settled(fit_terms(Likelihood(points, rest), starts, evaluations=4))
+    return settled(fit_terms(Likelihood(points, rest_without_effects(points)), starts, evaluations=4))
 
 
 def _in_its_form(term: Term) -> Start:

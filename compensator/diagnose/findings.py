@@ -234,7 +234,7 @@ def by_channels(found: Findings, *, names_are_useless: bool) -> Findings | None:
     elif names_are_useless or found.corrects_late_t_q:
         stays = False
     else:
-        known = _log_evidence(found.selection.before)
+        known = found.selection.before.log_evidence_as_it_is
         stays = _is_no_worse(found) or not _is_worth_deploying(found.channels, known, evidence)
     if evidence.is_sparse or stays:
         return None
@@ -258,78 +258,94 @@ def _findings_of(
     foresight: Foresight | None,
     leaves_late: bool | None,
 ) -> Findings:
+    """Search once, and choose what is deployed beside the named effects or in their place."""
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
-    points = search.points
+    before, points = selection.before, search.points
     nothing = np.zeros(points.count)
     background = Background(evidence)
-    channels = background.fitted(points, nothing, selection.before.rest)
+    channels = background.fitted(points, nothing, before.rest)
     is_of_paths = (
         not selection.fit.terms
-        and search.criterion.is_of_paths(selection.before)
-        and not _is_worth_deploying(channels, _log_evidence(selection.before), evidence)
+        and search.criterion.is_of_paths(before)
+        and not _is_worth_deploying(channels, before.log_evidence_as_it_is, evidence)
     )
     if is_of_paths:
-        selection = search.of_paths(selection.before) or selection
+        selection = search.of_paths(before) or selection
     fit, foresight = foreseeing(selection.fit, foresight)
-    late = late_term(fit)
-    others = [term for term in fit.terms if term is not late]
     paths = Background(evidence, channels=False) if evidence.free_paths else None
-    refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
-    likelihood, named = fit.likelihood, as_deployed(fit)
-    deployed = named
-    remainder: Regressed | None
-    is_own_error = False
-    if is_of_paths:
-        remainder, deploys_names, is_own_error = own_error_alone(selection.before), not selection.fit.terms, True
-    elif late:
-        remainder, deploys_names = _beside_late(deployed[2]), True
-    else:
-        remainder, deploys_names = _remainder(search, fit, background, refitted, channels)
-    if remainder is None and _has_own_error(fit):
-        fit = foretelling(fit)
-        deployed = as_deployed(fit)
-        remainder, is_own_error = own_error(deployed[2]), True
-    terms, responses, _ = deployed
-    found = Findings(
+    alone = paths.fitted(points, nothing, before.rest) if paths else None
+    refitted = paths.fitted(points, fit.added, fit.rest) if paths and fit is not before else alone
+    terms, responses, corrected = as_deployed(fit)
+    named = Findings(
         search=search,
         selection=selection,
         fit=fit,
         terms=terms,
         responses=tuple(responses),
-        remainder=remainder,
-        is_own_error=is_own_error,
-        deploys_names=deploys_names,
+        remainder=None,
+        is_own_error=False,
+        deploys_names=True,
         channels=channels,
-        paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
+        paths=alone.added if alone else np.zeros(evidence.used.size),
         refitted=refitted,
         foresight=foresight,
     )
+    if is_of_paths:
+        own = own_error_alone(before)
+        return dataclasses.replace(named, remainder=own, is_own_error=True, deploys_names=not terms)
+    late = late_term(fit)
+    if late is None:
+        remainder, deploys_names = _remainder(search, fit, background, refitted, channels)
+    else:
+        remainder, deploys_names = _beside_late(corrected), True
+    found = dataclasses.replace(named, remainder=remainder, deploys_names=deploys_names)
+    if remainder is None and _has_own_error(fit):
+        found = _with_own_error(named)
+    return found if late is None else _corrected_or_left_in(found, named, late, leaves_late)
+
+
+def _with_own_error(named: Findings) -> Findings:
+    """Return named effects with the base's own error beside them, fitted anew to foretell together."""
+    fit = foretelling(named.fit)
+    terms, responses, corrected = as_deployed(fit)
+    return dataclasses.replace(
+        named, fit=fit, terms=terms, responses=tuple(responses), remainder=own_error(corrected), is_own_error=True
+    )
+
+
+def _corrected_or_left_in(found: Findings, named: Findings, late: Term, leaves_late: bool | None) -> Findings:
+    """Leave a late T_Q in where the correction in real time gains nothing beside other effects.
+
+    Parameters
+    ----------
+    found, named : Findings
+        With the late T_Q corrected: all that is deployed, and the named effects alone.
+    late : Term
+        The late T_Q among these.
+    leaves_late : bool or None
+        As in `findings_of`.
+    """
+    evidence = found.search.evidence
+    others = [term for term in named.fit.terms if term is not late]
     # A late T_Q alone is judged with everything that is deployed (`deployment.py`).
     has_others = any(term.effect.deployable for term in others)
-    if late is None or not has_others or evidence.is_sparse or evidence.free_paths or leaves_late is False:
+    if not has_others or evidence.is_sparse or evidence.free_paths or leaves_late is False:
         return found
-    as_it_is = fit_terms(likelihood, [term.start for term in others])
+    as_it_is = fit_terms(named.fit.likelihood, [term.start for term in others])
     if leaves_late is None:
         # By the named effects alone: an own error takes in a lag, and goes elsewhere on another day.
-        alone = _named_alone(found)
-        own_um = in_free_run(dataclasses.replace(alone, terms=named[0], responses=tuple(named[1])))[1]
-        leaves_late = in_free_run(_left_in(alone, late, as_it_is))[1] <= own_um
-    return _late_left_in(found, late, as_it_is) if leaves_late else found
+        leaves_late = in_free_run(_left_in(named, late, as_it_is))[1] <= in_free_run(named)[1]
+    return _late_left_in(named, late, as_it_is) if leaves_late else found
 
 
-def _late_left_in(found: Findings, late: Term, others: Fit) -> Findings:
+def _late_left_in(named: Findings, late: Term, others: Fit) -> Findings:
     """Return findings whose late T_Q is named and not corrected, beside others that are fitted to T_Q as it is."""
     fit = settled(others)
     if not _has_own_error(fit):
-        return _left_in(_named_alone(found), late, fit)
+        return _left_in(named, late, fit)
     fit = foretelling(fit)
-    return _left_in(dataclasses.replace(_named_alone(found), remainder=own_error(fit), is_own_error=True), late, fit)
-
-
-def _named_alone(found: Findings) -> Findings:
-    """Return findings without a remainder."""
-    return dataclasses.replace(found, remainder=None, is_own_error=False, deploys_names=True)
+    return _left_in(dataclasses.replace(named, remainder=own_error(fit), is_own_error=True), late, fit)
 
 
 def _left_in(found: Findings, late: Term, fit: Fit) -> Findings:
@@ -409,7 +425,7 @@ def _remainder(
     """
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else channels
-    known = refitted.log_evidence if refitted else _log_evidence(fit)
+    known = refitted.log_evidence if refitted else fit.log_evidence_as_it_is
     # A name costs something, its deployment does not. But where nothing is known of the paths, names carry the whole
     # deformation into states that were not seen.
     charge = search.criterion.charge(fit) + WORTH if evidence.free_paths else 0.0
@@ -433,7 +449,7 @@ def _beside_late(corrected: Fit) -> Regressed | None:
     alone = settled(corrected)
     points = alone.likelihood.points
     beside = Background(points.evidence, recent=True).fitted(points, alone.added, alone.rest)
-    return beside if _is_worth_deploying(beside, _log_evidence(alone), points.evidence) else None
+    return beside if _is_worth_deploying(beside, alone.log_evidence_as_it_is, points.evidence) else None
 
 
 def _is_worth_deploying(beside: Regressed, known: float, evidence: Evidence) -> bool:
@@ -441,9 +457,3 @@ def _is_worth_deploying(beside: Regressed, known: float, evidence: Evidence) -> 
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)
     return beside.log_evidence > known + WORTH and size > least
-
-
-def _log_evidence(fit: Fit) -> float:
-    """Return the logarithm of the probability of the data with a fit's effects as they are."""
-    left = fit.likelihood.left_by(fit.added)
-    return fit.likelihood.log_prior - 0.5 * (float(left @ left) + fit.likelihood.log_det)

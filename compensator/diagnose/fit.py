@@ -105,6 +105,12 @@ class Fit:
         """Place and form of each effect."""
         return frozenset(term.hypothesis.label for term in self.terms)
 
+    @property
+    def log_evidence_as_it_is(self) -> float:
+        """Logarithm of the probability of the data with the effects as they are, nothing of them integrated out."""
+        left = self.likelihood.left_by(self.added)
+        return self.likelihood.log_prior - 0.5 * (float(left @ left) + self.likelihood.log_det)
+
     def projected(self, likelihood: Likelihood) -> tuple[Matrix, Vector]:
         """Return the columns of the amplitudes, and the data without what has none, as a likelihood projects them."""
         return likelihood.projected(self.columns), likelihood.left_by(self.fixed)

@@ -188,6 +188,12 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest) ->
     return start.with_logs(at)
 
 
+def rest_without_effects(points: Points) -> Rest:
+    """Return the rest with which data are most probable if nothing acts."""
+    nothing = np.zeros(points.count)
+    return learned_rest(points, np.zeros((points.count, 0)), nothing, points.typical_rest())
+
+
 def dense(likelihood: Likelihood) -> Matrix:
     """Return the projection as one matrix, for many columns at once."""
     return likelihood.projected(np.eye(likelihood.points.count))

@@ -74,6 +74,4 @@ def own_error(fit: Fit) -> Regressed:
     effect = dataclasses.replace(
         shape, gains=tuple(map(tuple, found.reshape(len(channels), -1).tolist())), std_factor=rows
     )
-    left = likelihood.left_by(fit.added)
-    log_evidence = likelihood.log_prior - 0.5 * (float(left @ left) + likelihood.log_det)
-    return Regressed(effect=effect, added=columns @ found, log_evidence=log_evidence, rest=rest)
+    return Regressed(effect=effect, added=columns @ found, log_evidence=fit.log_evidence_as_it_is, rest=rest)

@@ -17,7 +17,7 @@ import numpy as np
 from compensator.diagnose.criterion import MOSTLY, Criterion
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
-from compensator.diagnose.likelihood import Likelihood, learned_rest
+from compensator.diagnose.likelihood import Likelihood, rest_without_effects
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.standard_errors import deviations
@@ -119,9 +119,7 @@ class Search:
             Whether an unobserved source is looked for.
         """
         unobserved = unobserved and not self.evidence.free_paths
-        nothing = np.zeros(self.points.count)
-        rest = learned_rest(self.points, np.zeros((nothing.size, 0)), nothing, self.points.typical_rest())
-        before = fit_terms(Likelihood(self.points, rest), [])
+        before = fit_terms(Likelihood(self.points, rest_without_effects(self.points)), [])
         self.criterion.something_acts = self.evidence.is_sparse and not self.criterion.leaves_noise(before)
         grown, undecided = self._grown(before, unobserved=unobserved)
         best = self._pruned(grown)
