@@ -33,10 +33,11 @@ from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.named_effects import named_effects, ranked
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict, warnings_of
+from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict
 from compensator.diagnose.points import Points
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.verdict import ceiling_of, judged
+from compensator.diagnose.warning_words import warnings_on
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import Place
 from compensator.model.thermal_model import ThermalModel
@@ -209,16 +210,6 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
     refused = _refused(chosen)
     left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
-    warnings = warnings_of(
-        effects,
-        held_out.nothing,
-        held_out.whole,
-        deployed=deployed,
-        few=few,
-        worse_um=chosen.worse_um,
-        too_short_h=chosen.too_short_h,
-        start_k=evidence.start_k,
-    )
     return Diagnosis(
         verdict="unexplained" if hides or chosen.reverses_path else verdict,
         effects=effects,
@@ -238,7 +229,7 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
             *searched.left_out,
             *remarks,
             *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off),
-            *warnings,
+            *warnings_on(chosen, deployed=deployed),
         ),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),

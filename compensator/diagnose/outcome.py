@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from compensator.arrays import Vector, rms_of
-from compensator.codes import ModelWarning, Remark
+from compensator.arrays import Vector
+from compensator.codes import Remark
 from compensator.diagnose.advice import Advice
 from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.detection_limit import DetectionLimits
@@ -66,10 +65,6 @@ class Refused:
 
     why: str
     held_out: Vector
-
-
-#: An error is said to be worse from this many times another one on.
-CLEARLY_WORSE = 1.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,88 +203,3 @@ class Diagnosis:
     def _scores(self, residual: Vector) -> Scores:
         y = self.evidence.y_um
         return scores(y, y - residual)
-
-
-def warnings_of(
-    effects: Sequence[FoundEffect],
-    before: Vector,
-    after: Vector,
-    *,
-    deployed: bool,
-    few: bool = False,
-    worse_um: tuple[float, float] | None = None,
-    too_short_h: float | None = None,
-    start_k: float = 0.0,
-) -> tuple[Remark, ...]:
-    """Return what to know before relying on the effects that were found.
-
-    Parameters
-    ----------
-    effects : sequence of FoundEffect
-        Effects.
-    before, after : numpy.ndarray, shape (n,)
-        What is left on held-out data without and with them, µm.
-    deployed : bool
-        Whether the extended model has any.
-    few : bool
-        Whether Y was measured now and then, so that held-out blocks do not decide what is deployed.
-    worse_um : tuple of float, optional
-        What is left in free run without and with what would be deployed, µm rms, where that is clearly worse.
-    too_short_h : float, optional
-        Length of the record, h, where it is too short for what would be deployed.
-    start_k : float
-        T_Q − AT at the coolest start, K, where that is not at rest as far as T_Q shows; 0 where it is.
-    """
-    warnings = []
-    rms_before, rms_after = rms_of(before), rms_of(after)
-    if worse_um is not None:
-        text = (
-            "In free run over the same data (zero of each run fitted) what would be deployed increases the error "
-            f"({worse_um[1]:.2f} against {worse_um[0]:.2f} µm rms), so the model was left unchanged."
-        )
-        warnings.append(Remark(ModelWarning.WORSE_IN_FREE_RUN, text))
-    elif too_short_h is not None:
-        text = (
-            f"What was found explains a record of {too_short_h:.1f} h only in part, and in so few hours the own error "
-            "of the model looks like an effect, so it was left unchanged."
-        )
-        warnings.append(Remark(ModelWarning.TOO_SHORT, text))
-    # A source that no channel shows predicts nothing and is never deployed: what is, or could be, must.
-    elif (deployed or any(effect.effect.observed for effect in effects)) and (
-        rms_after > rms_before or (deployed and rms_after == rms_before)
-    ):
-        numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
-        if deployed or few:
-            worse = "no better" if rms_after <= CLEARLY_WORSE * rms_before else "worse"
-            text = f"What was found is clear in all data together, but predicts held-out blocks {worse} {numbers}."
-            warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
-        else:
-            text = f"The effects increase the error on held-out blocks {numbers}, so the model was left unchanged."
-            warnings.append(Remark(ModelWarning.MADE_WORSE, text))
-    for effect in effects:
-        kind, named, loose = effect.place[0], effect.named, effect.hardly_determined
-        if start_k and effect.term.effect.counts_from_rest and effect.place[1] == "DTF":
-            text = (
-                f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from its start, as if "
-                "the machine were at rest there. On a run that begins cooler it is wrong."
-            )
-            if effect.term.hypothesis.rest == EQUAL:
-                text = (
-                    f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from {EQUAL}, "
-                    "where the machine is taken to be at rest. The free runs here begin as warm as their data."
-                )
-            warnings.append(Remark(ModelWarning.WARM_START, text))
-        if effect.reverses_path:
-            text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left unchanged."
-            warnings.append(Remark(ModelWarning.PATH_REVERSED, text))
-        if loose:
-            # Two lags near each other share one response: what matters at rest is known.
-            known = [name for name in named if name.startswith("gain_um_per_") and name not in loose]
-            together = f"; their sum, {known[0]}, is determined" if known and len(loose) > 1 else ""
-            text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value{together}."
-            warnings.append(Remark(ModelWarning.HARDLY_DETERMINED, text))
-        if effect.rivals:
-            names = ", ".join(rival.label for rival in effect.rivals)
-            how = "as well, or nearly" if any(rival.log_evidence > 0.0 for rival in effect.rivals) else "nearly as well"
-            warnings.append(Remark(ModelWarning.NEARLY_AS_GOOD, f"{kind}: {names} would explain it {how}."))
-    return tuple(warnings)

@@ -1,11 +1,13 @@
 """Runs of the published machine with an undeclared effect, drawn by a seed, by arithmetic of their own."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.signal import lfilter
 
 import compensator as tc
+from compensator.diagnose.deployment import Deployment
 from compensator.diagnose.held_out import HeldOut
 from sim_hardware.physics import Duty
 from sim_hardware.physics.published import DEFORMATION_POLES, DTF, TDTF, TTF, TTF_POLES, tustin
@@ -160,6 +162,20 @@ def record(scenarios, seed, hours=36.0, *, noise_k=0.02, noise_um=0.3):
 def held_out_errors(nothing: np.ndarray, *, named: np.ndarray, whole: np.ndarray, ceiling: np.ndarray) -> HeldOut:
     """Errors on held-out blocks that are made up: the base is as it was."""
     return HeldOut(base=nothing, nothing=nothing, named=named, whole=whole, ceiling=ceiling, steps=())
+
+
+def chosen(effects: tuple, *, left: float, worse_um: tuple[float, float] | None = None) -> Deployment:
+    """What is chosen of effects in many values, which leave so many times the error on held-out blocks."""
+    errors = left * np.ones(9)
+    evidence = SimpleNamespace(start_k=0.0, is_sparse=False)
+    return Deployment(
+        found=SimpleNamespace(search=SimpleNamespace(evidence=evidence)),
+        effects=effects,
+        held_out=held_out_errors(np.ones(9), named=errors, whole=errors, ceiling=errors),
+        contradicted=False,
+        worse_um=worse_um,
+        too_short_h=None,
+    )
 
 
 def errors_on_another_day(machine, *models):

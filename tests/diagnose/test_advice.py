@@ -15,16 +15,16 @@ from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.nearest import Near, nearest
-from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.points import Points
 from compensator.diagnose.record_with_test import HOURS as HOURS_OF_TESTS
 from compensator.diagnose.record_with_test import expected_change
 from compensator.diagnose.summary import contents, figures
 from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
+from compensator.diagnose.warning_words import warnings_on
 from compensator.display import Words
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of
-from tests.diagnose.scenarios import Scenario, lag, record, signals
+from tests.diagnose.scenarios import Scenario, chosen, lag, record, signals
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -319,7 +319,7 @@ def test_a_source_that_no_channel_shows_is_no_reason_to_record_for_longer():
             rivals=(),
             reverses_path=False,
         )
-        return [remark.code for remark in warnings_of([effect], np.ones(9), 2.0 * np.ones(9), deployed=False)]
+        return [remark.code for remark in warnings_on(chosen((effect,), left=2.0), deployed=False)]
 
     assert codes(observed=False) == [] and codes(observed=True) == ["made_worse"]
 

@@ -17,10 +17,10 @@ from compensator.diagnose import findings as module
 from compensator.diagnose.deployment import CONTRADICTS, _by_channels, _decided
 from compensator.diagnose.diagnosis import _evidence
 from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
-from compensator.diagnose.outcome import warnings_of
 from compensator.diagnose.summary import verdict
+from compensator.diagnose.warning_words import warnings_on
 from sim_hardware.drawn_machines.cases import _cases
-from tests.diagnose.scenarios import errors_on_another_day, held_out_errors
+from tests.diagnose.scenarios import chosen, errors_on_another_day, held_out_errors
 from tests.diagnose.test_standing import found as diagnosed
 
 #: Seeds of machines, and the orders that `identify` finds for them: given to it, as finding them takes longest here.
@@ -234,7 +234,7 @@ def test_channels_that_show_a_source_together_make_up_for_it() -> None:
 
 
 def test_it_is_said_why_nothing_is_deployed() -> None:
-    [remark] = warnings_of([], np.ones(9), 0.5 * np.ones(9), deployed=False, worse_um=(0.91, 9.4))
+    [remark] = warnings_on(chosen((), left=0.5, worse_um=(0.91, 9.4)), deployed=False)
     assert remark.code == ModelWarning.WORSE_IN_FREE_RUN and "(9.40 against 0.91 µm rms)" in remark
     words = verdict(diagnosed(verdict="partly_explained", warning_codes=[str(remark.code)]))
     assert "increases the error in free run" in words and "were found" not in words

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from compensator.arrays import rms_of
 from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
@@ -15,7 +16,6 @@ from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.extended_model import with_effects
 from compensator.diagnose.findings import findings_of, in_free_run
-from compensator.diagnose.outcome import rms_of
 from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings

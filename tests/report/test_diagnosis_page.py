@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.arrays import rms_of
 from compensator.data.measurement import read
 from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Refused, Remainder, Step, rms_of
+from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Refused, Remainder, Step
 from compensator.diagnose.points import Points
 from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
 from compensator.display import text_of_all
