@@ -179,15 +179,16 @@ def findings_of(
     leaves_late : bool, optional
         Whether a late T_Q beside other effects is left in, by a search over all data; by default it is decided.
     """
-    found = _findings_of(evidence, grid, unobserved=unobserved, foresight=foresight, leaves_late=leaves_late)
+    search = Search(evidence, grid)
+    found = _findings_of(search, unobserved=unobserved, foresight=foresight, leaves_late=leaves_late)
     if evidence.is_sparse or all(term.effect.observed for term in found.terms):
         return found
     base_um, own_um = in_free_run(found)
     if own_um <= base_um and not _is_surpassed(found):
         return found
     known = found.foresight or foresight
-    shown = _findings_of(evidence, found.search.grid, unobserved=False, foresight=known, leaves_late=leaves_late)
-    rms = found.search.criterion.rms
+    shown = _findings_of(search, unobserved=False, foresight=known, leaves_late=leaves_late)
+    rms = search.criterion.rms
     nothing, hidden, left = (rms(terms) ** 2 for terms in ((), found.fit.terms, shown.fit.terms))
     if left < hidden:
         return shown
@@ -251,17 +252,11 @@ def _is_no_worse(found: Findings) -> bool:
 
 
 def _findings_of(
-    evidence: Evidence,
-    grid: Grid | None,
-    *,
-    unobserved: bool,
-    foresight: Foresight | None,
-    leaves_late: bool | None,
+    search: Search, *, unobserved: bool, foresight: Foresight | None, leaves_late: bool | None
 ) -> Findings:
     """Search once, and choose what is deployed beside the named effects or in their place."""
-    search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
-    before, points = selection.before, search.points
+    before, points, evidence = selection.before, search.points, search.evidence
     nothing = np.zeros(points.count)
     background = Background(evidence)
     channels = background.fitted(points, nothing, before.rest)

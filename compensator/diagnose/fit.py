@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, factor_of, learned_rest, solution
-from compensator.diagnose.points import Rest, raw_columns
+from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place, place_in_words
 
@@ -296,15 +296,17 @@ def settled(fit: Fit) -> Fit:
     is not deployed with effects: with few values, exact forms or a dead time of T_Q.
     """
     points = fit.likelihood.points
-    sizes: dict[str, float] = {}
+    sizes, carried = dict[str, float](), list[float]()
     for term in fit.terms:
         _, path, channel = term.hypothesis.place
         if path or channel:
             of = "" if path else channel
-            added = response(points.evidence, term)[points.evidence.used]
-            sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
+            added = response(points.evidence, term)
+            sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added[points.evidence.used])))
+            if term.hypothesis.acts_by_temperature:
+                carried.append(_carried_um(points, added))
     rests = [points.with_forms_of(fit.rest, sizes)]
-    carried_um = math.hypot(*(_carried_um(fit, term) for term in fit.terms if term.hypothesis.acts_by_temperature))
+    carried_um = math.hypot(*carried)
     if carried_um and not (points.is_exact or points.evidence.is_sparse or has_dead_time(fit)):
         more = dataclasses.replace(rests[0], own_um=math.hypot(rests[0].own_um, carried_um))
         rests = [more] if points.foretells else [*rests, more]
@@ -313,10 +315,9 @@ def settled(fit: Fit) -> Fit:
     return max(fits, key=lambda one: one.log_evidence)
 
 
-def _carried_um(fit: Fit, term: Term) -> float:
+def _carried_um(points: Points, response_um: Vector) -> float:
     """Return how much of what an effect adds responses of the base's paths explain, standard deviation in µm."""
-    points = fit.likelihood.points
-    added = points.averaged(response(points.evidence, term)[:, None])
+    added = points.averaged(response_um[:, None])
     table = np.concatenate([points.fast, points.slow], axis=1)
     table = table - table.mean(axis=0)
     explained = table @ np.linalg.lstsq(table, added - added.mean(), rcond=None)[0]

@@ -111,8 +111,8 @@ def test_channels_that_explain_it_alone_take_the_place_of_the_source(monkeypatch
     searched = []
     once = module._findings_of
 
-    def noted(evidence: Any, grid: Any, **asked: Any) -> Any:
-        searched.append(once(evidence, grid, **asked))
+    def noted(search: Any, **asked: Any) -> Any:
+        searched.append(once(search, **asked))
         return searched[-1]
 
     monkeypatch.setattr(module, "_findings_of", noted)
