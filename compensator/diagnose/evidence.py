@@ -31,7 +31,7 @@ from compensator.diagnose.base_run import (
     without_noise,
 )
 from compensator.diagnose.no_causes import no_causes
-from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error
+from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error_um
 from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
@@ -283,7 +283,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
     basis = basis_of(nuisances, used)
     # The noise of a value that was measured now and then is none of the calibration's.
-    own_um = own_error(model, 0.0 if sparse else noise_um, spread_um)
+    own_um = own_error_um(model, 0.0 if sparse else noise_um, spread_um)
     count, freedom = int(used.sum()), freedom_of(used, basis) if sparse else 0
     return Evidence(
         model=model,

@@ -75,7 +75,7 @@ class NoiseTest:
         return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
 
 
-def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:
+def own_error_um(model: ThermalModel, noise_um: float, spread_um: float) -> float:
     """Return the base model's own error from its calibration, less the noise, µm rms, as far as one is granted."""
     return min(_missed_um(model, noise_um), OWN_SHARE * spread_um)
 
