@@ -201,6 +201,11 @@ class FurtherOutputs:
             state = self.states[one.name]
             state.rates = [*state.rates[1 - samples :], found.rate_per_min]
 
+    def forget_rates(self) -> None:
+        """Forget the rates from before a pause."""
+        for state in self.states.values():
+            state.rates = []
+
     def largest_rate_um_per_min(self) -> float:
         """Return the largest mean rate of an axis over the last samples, µm/min; 0 without further axes."""
         means = [

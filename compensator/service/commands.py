@@ -126,13 +126,21 @@ class Commands:
         warm_um = self._running().warm_um if arguments.get("mode") == "rest" else None
         loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
         warning = f"{DOUBT}{doubt_of_rest(warm_um)}" if warm_um is not None else ""
-        return {"ok": True, "text": f"{name}: acts at the next sample{warning}"}
+        waits = _counts_on_state(name, arguments) and self._running().has_gap
+        when = "once T_Q and AT have been there for a sample" if waits else "at the next sample"
+        return {"ok": True, "text": f"{name}: acts {when}{warning}"}
 
     def apply(self, compensation: Compensation) -> None:
-        """Apply the commands that arrived since the last sample."""
+        """Apply the commands that arrived since the last sample.
+
+        A zero on a warm machine waits for the sample after a gap: it is set before the engine has repeated the gap.
+        """
         self._refused, self._is_answered = 0, False
-        while not self._waiting.empty():
+        for _ in range(self._waiting.qsize()):
             name, arguments, sender = self._waiting.get_nowait()
+            if _counts_on_state(name, arguments) and compensation.has_gap:
+                self._waiting.put_nowait((name, arguments, sender))
+                continue
             self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
             try:
@@ -300,3 +308,8 @@ class Commands:
         self._refused += 1
         if self._refused <= NOTED_REFUSALS:
             self._events.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sender.data())
+
+
+def _counts_on_state(name: str, arguments: dict[str, Any]) -> bool:
+    """Return whether a command needs to know what the machine has stored: a zero that may be on a warm one."""
+    return name == CommandName.ZERO and arguments.get("mode", "auto") != "rest"

@@ -122,6 +122,11 @@ class Continuity:
         return {one.name: 0.0 - predicted.value for one, predicted in zip(self.outputs.planned, found, strict=True)}
 
     @property
+    def has_gap(self) -> bool:
+        """Whether T_Q or AT was missing up to now: with the next sample the state is not yet that of its time."""
+        return self._engine.has_reference and self._memory.missing_min > 0.0
+
+    @property
     def predicts_until_ns(self) -> int | None:
         """Time of the sample that is held if the missing temperature does not return; None while none is missing."""
         memory, predict_min = self._memory, self._config.loss.predict_for_min
@@ -238,6 +243,10 @@ class Continuity:
         self._guards.pass_time(minutes)
         self.plausibility.pass_time(samples)
         self._memory.missing_min += minutes
+        if not self._zero.wanted:
+            # How it was heated before says nothing of now: a zero must not be one at rest by it.
+            self._memory.rates, self._memory.heats = [], []
+            self.outputs.forget_rates()
         if not self._engine.has_reference:
             return
         is_cold = minutes > self.bridge_max_min

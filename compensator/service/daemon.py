@@ -238,6 +238,7 @@ class Daemon:
                 await self._sample(label_ns)
         except Exception as error:
             log.exception("internal error")
+            await self._await_pending()  # or its event had the number of that sample, and were recorded with the next
             self._fail(error)
             if label_ns is not None:
                 await self._hold(label_ns)
@@ -249,7 +250,6 @@ class Daemon:
 
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset is held, without the sample that could not be processed."""
-        await self._await_pending()
         self._sampler.close_sample()  # its readings belong to no later sample
         machine, sequence = self._config.machine.name, self._events.sequence
         held, *further = self._compensation.held_axes(machine, sequence, label_ns)
@@ -368,6 +368,7 @@ class Daemon:
         It is on record: a defect must publish nothing else with its number.
         """
         entry = decided.entry
+        self._adoption.follow(decided.outcome)
         try:
             offsets = self._journal.resolve(entry)
             offset = offsets["offset"]
@@ -383,14 +384,13 @@ class Daemon:
         self.latency_s.append(time.perf_counter() - decided.began)
         self._events.sequence += 1
         outcome = replace_fields(decided.outcome, offset=offset, further=further)
-        self._adoption.follow(outcome)
         self._unreported.append(outcome)
         try:
             self._publish("sample", entry.sample)
             self._publish("estimate", entry.estimate)
             self._publish("status", encode(self._status(outcome)))
             if self._loop is not None:
-                self._loop.after_sample(outcome)
+                self._loop.after_sample()
         except Exception:
             log.exception("internal error after the offset was published")
 

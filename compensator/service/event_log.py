@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -9,6 +10,8 @@ from compensator.clock import Clock
 from compensator.errors import one_line
 from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, encode
+
+log = logging.getLogger("compensator")
 
 #: Largest number of events that are kept for the recording; beyond that the oldest are dropped.
 WAITING_EVENTS = 1000
@@ -40,7 +43,10 @@ class EventLog:
         )
         # Bounded, so that memory does not grow if nothing can be recorded.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
-        self._publish("event", encode(event))
+        try:
+            self._publish("event", encode(event))
+        except Exception:
+            log.exception("internal error of publishing an event, which is recorded")
 
     def drain(self) -> list[Event]:
         """Return the events since the last call."""

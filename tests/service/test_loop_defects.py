@@ -130,6 +130,25 @@ async def test_after_a_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, d
     checked(machine)
 
 
+async def test_a_message_that_cannot_be_sent(tmp_path: Path) -> None:
+    """The event is on record; the sample of a warm-up counts, with the zero that was set with it."""
+    machine = Looping(tmp_path, shown(extended()))
+    take, unsent = machine.publish, ["event", "sample", "event", "estimate"]
+
+    def publish(name: str, data: bytes) -> None:
+        kind = json.loads(data).get("kind")
+        if unsent and name == unsent[0] and (name != "event" or kind in ("loop", "diagnosis")):
+            unsent.pop(0)
+            raise RuntimeError("the session is closed")
+        take(name, data)
+
+    machine.publish = publish  # type: ignore[method-assign]
+    await machine.run(EVENING + 60)
+    assert not unsent and len(taken(machine)) == 1
+    unharmed(machine, EVENING + 60)
+    checked(machine)
+
+
 async def test_a_model_that_cannot_be_stored_is_not_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor does it keep the loop, or a person, waiting for it."""
     machine = Looping(tmp_path, shown(extended()))

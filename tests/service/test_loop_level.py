@@ -23,7 +23,8 @@ from compensator.service.loop import loop as loop_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero
 from compensator.service.loop.run import LoopRun
-from compensator.service.loop.state import NO_VERDICT, Place
+from compensator.service.loop.state import NO_VERDICT, LoopState, Place, Running
+from compensator.service.loop.weighing import Diagnosed, without_candidate
 from compensator.service.replay import opening_of
 from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
@@ -156,6 +157,18 @@ def test_a_diagnosis_that_sees_the_time_and_finds_no_move_of_y_refutes_one(later
     loop = LoopRun(settings(loop={"every_h": every_h, "record_h": record_h}), QUILL_FILE, Night(drifted, *[later] * 9))
     steps = run(loop, machine(3 * DAY), 2 * DAY)
     assert ("adopt" in [step for _, step, _ in decisions(steps)]) == is_adopted
+
+
+def test_the_present_model_without_an_effect_refutes_no_move_of_y():
+    """Nothing was diagnosed then."""
+    hour_ns, now_ns = 3600 * 10**9, 500_000 * 3600 * 10**9
+    moved_ns = now_ns - 18 * hour_ns
+    for without, remains_ns in (("gain:DTF", moved_ns), ("", 0)):
+        state = LoopState(zero_utc_ns=now_ns - 30 * hour_ns, y_moved_ns=moved_ns, time_utc_ns=now_ns)
+        state.diagnosis = Running(from_utc_ns=now_ns - 36 * hour_ns, to_utc_ns=now_ns, why="misfit", without=without)
+        loop = loop_module.Loop(Loop(), 60.0, ["gain:DTF"], state)
+        loop.receive(without_candidate(Diagnosed("", (), None, "", without=without)), now_ns)
+        assert state.y_moved_ns == remains_ns
 
 
 def test_newer_parameters_of_the_present_effects_show_no_level():

@@ -20,9 +20,11 @@ from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import parse_config
+from compensator.events import EventKind
 from compensator.messages import Candidate, Event
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
+from compensator.service.event_log import EventLog
 from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
@@ -504,16 +506,16 @@ async def test_what_is_exchanged_stays_exchanged_whatever_fails_after_it(
 ) -> None:
     """The offset goes on with the model that the recordings, the store and the events name."""
     machine = Looping(tmp_path, shown(extended()))
-    take = machine.publish
+    note = EventLog.note
 
-    def fails(name: str, data: bytes) -> None:
-        take(name, data)
-        if name == "event" and b'"kind":"adopt"' in data:
+    def fails(log: EventLog, kind: EventKind, text: str, data: Any = None) -> None:
+        note(log, kind, text, data)
+        if kind == EventKind.ADOPT:
             raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(machine, "publish", fails)
+    monkeypatch.setattr(EventLog, "note", fails)
     await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
-    monkeypatch.setattr(machine, "publish", take)
+    monkeypatch.undo()
     await machine.run(30)
     assert {one.offset.model_sha256 for one in machine.outcomes[-30:]} == {sha256_of(extended())}
     assert machine.store.in_use() == extended()

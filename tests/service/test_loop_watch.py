@@ -411,7 +411,7 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
     )
 
     async def sample() -> Compensation:
-        loop.after_sample(outcomes[-1])
+        loop.after_sample()
         await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
         loop.hand_over(present)
         return loop.before_sample(present)

@@ -79,3 +79,13 @@ def test_a_remainder_alone_is_told_by_its_channels() -> None:
     assert effect_names(first.effects) == ["regression:heat_w+floor_degc"]
     assert difference(again, first) == (False, math.inf)
     assert not difference(extended(coolant(2.0)), first)[0]
+
+
+def test_effects_that_a_diagnosis_has_added_to_those_of_the_calibrated_model_are_compared() -> None:
+    """Their factors begin with an empty row for each effect that was there before."""
+    first, again = (
+        extended(coolant(2.0), ("gain", {"path": "DTF", "change": change, "std_factor": [[], [0.05]]}))
+        for change in (0.2, 0.3)
+    )
+    same, deviations = difference(again, first)
+    assert same and math.isclose(deviations, 2.0)

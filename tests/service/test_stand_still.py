@@ -17,6 +17,7 @@ from compensator.messages import number
 from compensator.recording.reading import recordings
 from compensator.service.loop.state import LoopState
 from compensator.service.sampling import Grid
+from drivers.reading import Quality, Reading
 from tests.audit.made import CONFIG, QUILL
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.looping import extended, shown
@@ -221,3 +222,32 @@ async def test_a_model_that_begins_in_shadow_after_it_has_passed_it(tmp_path: Pa
     assert first.y_std_um == pytest.approx(present.y_std_um, rel=0.2)
     assert number(first.y_pred_um) == pytest.approx(number(present.y_pred_um), rel=0.15)
     checked(machine)
+
+
+@pytest.mark.parametrize("begins", [540, 660])
+async def test_a_zero_on_a_warm_machine_waits_for_what_the_machine_did_meanwhile(tmp_path: Path, begins: int) -> None:
+    """T_Q is lost for half an hour, in which the heat changes; a person sets a zero in that time."""
+    machine = Machine(tmp_path)
+    answers: list[Any] = []
+
+    def lose() -> None:
+        machine.device.replaced[0] = Reading.bad(Quality.OPEN, "wire broken")
+
+    machine.at_sample[begins] = lose
+    machine.at_sample[begins + 15] = lambda: answers.append(machine.command("zero", b'{"mode": "warm"}'))
+    machine.at_sample[begins + 30] = machine.device.replaced.clear
+    await machine.run(begins + 90)
+    assert answers[0] == {"ok": True, "text": "zero: acts once T_Q and AT have been there for a sample"}
+    assert abs(number(machine.outcomes[begins + 28].estimate.residual_um)) > 8.0  # what it would be wrong by
+    assert all(abs(number(one.estimate.residual_um)) < 3.0 for one in machine.outcomes[begins + 31 :])
+    assert check_files(machine) == begins + 90
+
+
+async def test_after_a_restart_a_zero_is_not_one_at_rest_by_what_the_machine_did_before(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    await machine.run_and_kill(620)  # cool for an hour
+    await machine.sleep(60.0)  # it works meanwhile
+    machine.at_sample[621] = lambda: machine.command("zero")
+    await machine.run(15)
+    zero = machine.events("zero")[-1]
+    assert zero.data["mode"] == "warm" and zero.seq == machine.outcomes[621].sample.seq

@@ -283,6 +283,8 @@ class LiveLoop:
         followed = self._guarded(lambda core: core.process(outcome), Followed((), ()), again=alone)
         self._note(followed.notes)
         self._candidates = followed.candidates
+        if self._warming is not None:
+            self._warming.since.append(outcome)
         return followed.candidates
 
     def _guarded(
@@ -326,10 +328,8 @@ class LiveLoop:
         self._events.note(*_failed(f"{why}; the loop is off until the next start"))
         return otherwise
 
-    def after_sample(self, outcome: Outcome) -> None:
+    def after_sample(self) -> None:
         """Begin what was decided with a sample that is published."""
-        if self._warming is not None:
-            self._warming.since.append(outcome)
         storing = self._storing
         if storing.is_done and not (storing.is_working or self.is_exchanging):
             # An exchange that a defect has ended: the next start must find the model that goes on.

@@ -269,7 +269,8 @@ class Loop:
         if running is None or running.candidate_sha256:
             return []  # what another one has found is warmed up, or begins
         state.diagnosis = None
-        self._judge_y(found, running)
+        if not found.without:  # nothing was diagnosed then
+            self._judge_y(found, running)
         why = why_nothing(state, self._settings, found, now_ns) if is_current else "replaced"
         if not why:
             state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256, found=found)

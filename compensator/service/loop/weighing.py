@@ -196,7 +196,8 @@ def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
 
 def _change(effect: Effect, other: Effect) -> float:
     """Return by how many standard deviations the parameter of an effect that differs most does."""
-    factors = [math.hypot(*column) for column in zip(*effect.std_factor, strict=True)]
+    rows = filter(None, effect.std_factor)  # those of effects that were there before are empty
+    factors = [math.hypot(*column) for column in zip(*rows, strict=True)]
     if factors and len(factors) == len(effect.parameters) == len(other.parameters):
         # `std` names what stands in lists one by one.
         moved = [abs(a - b) for a, b in zip(effect.parameters, other.parameters, strict=True)]
