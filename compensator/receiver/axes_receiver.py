@@ -132,7 +132,7 @@ class AxesReceiver(Client):
         for sample in answered(self._length_answers):
             length.receive(now_s, bytes_of(sample), utc_ns=self._utc_ns, asked=True)
         if self._lengths is not None:
-            utc_ns = self._utc_ns if self._source.check_clock else None
+            utc_ns = self._utc_ns if self._paused or self._source.check_clock else None
             for sample in waiting(self._lengths):
                 payload = bytes_of(sample) if sample.kind == zenoh.SampleKind.PUT else b""
                 length.receive(now_s, payload, utc_ns=utc_ns)

@@ -123,6 +123,7 @@ class Client(ABC):
         self._record_remark: Reason | None = None
         self._wanted: tuple[ProbeWanted | None, int, float] | None = None
         self._polled_s: float | None = None
+        self._paused = False
         self._session: Any = None
         self._opened: list[Any] = []
         self._ended = threading.Event()
@@ -175,7 +176,7 @@ class Client(ABC):
         """Process new messages, without waiting; return the time, s."""
         now_s = self._clock()
         # If this program was blocked, a message may have been waiting for an unknown time.
-        paused = self._polled_s is not None and now_s - self._polled_s > self._modes.step_max_s
+        self._paused = self._polled_s is not None and now_s - self._polled_s > self._modes.step_max_s
         self._polled_s = now_s
         if self._session is None and self._opened:
             self._declare(self._opened.pop())
@@ -184,7 +185,7 @@ class Client(ABC):
             self._receive_answers(now_s)
             self._receive_statuses(now_s)
             for sample in waiting(self._offsets):
-                self._receive(now_s, sample, check_age=paused or self._source.check_clock, asked=False)
+                self._receive(now_s, sample, check_age=self._paused or self._source.check_clock, asked=False)
             self._save()
         return now_s
 
@@ -227,20 +228,19 @@ class Client(ABC):
 
     def _receive_statuses(self, now_s: float) -> None:
         for sample in answered(self._status_answers):
-            self._receive_status(now_s, sample, asked=True)
+            self._receive_status(now_s, sample, check_age=True, asked=True)
         for sample in waiting(self._statuses):
-            self._receive_status(now_s, sample, asked=False)
+            self._receive_status(now_s, sample, check_age=self._paused, asked=False)
 
-    def _receive_status(self, now_s: float, sample: Any, *, asked: bool) -> None:
+    def _receive_status(self, now_s: float, sample: Any, *, check_age: bool, asked: bool) -> None:
         try:
             status = parse_status(bytes_of(sample), self._source.machine)
         except Rejected:  # the messages of the offset show what is wrong
             return
         time_utc_ns, measured_s = status.time_utc_ns, now_s
-        if asked:
-            if self._wanted is not None and time_utc_ns < self._wanted[1]:
-                return  # overtaken by a message
-            # A service whose sampling hangs still answers.
+        if asked and self._wanted is not None and time_utc_ns < self._wanted[1]:
+            return  # overtaken by a message
+        if check_age:  # a service whose sampling hangs still answers
             measured_s -= max((self._utc_ns() - time_utc_ns) / 1e9, 0.0)
         self._wanted = (status.wanted, time_utc_ns, measured_s)
 

@@ -164,6 +164,34 @@ def test_a_stranger_that_answers_with_thousands_of_keys_holds_up_no_offset(tmp_p
             service.close()
 
 
+def test_a_length_that_waited_while_the_loop_stood_still_is_as_old_as_it_is(tmp_path: Path) -> None:
+    port, now_s = free_port(), [1000.0]
+
+    def after_a_pause(receiver: AxesReceiver) -> set[str]:
+        now_s[0] += 7200.0
+        return codes(receiver.poll())
+
+    with router(port), ScriptedService(port) as service:
+        service.put_axes(1, heard=False, y=1.0, z=2.0, a=20.0)
+        with AxesReceiver(loaded(written(tmp_path, port)), clock=lambda: now_s[0]) as receiver:
+            until(lambda: receiver.poll().seq == 1, "a sample")
+            service.put_length(250.0, time_utc_ns=time.time_ns() - 6600 * 10**9)  # valid for 600 s
+            heard: list[set[str]] = []
+
+            def is_heard() -> bool:
+                heard.append(after_a_pause(receiver))
+                return "late" in heard[-1] or "no_tool_length" not in heard[-1]
+
+            until(is_heard, "the length")
+            assert {"late", "no_tool_length"} <= heard[-1]
+            service.put_length(120.0, time_utc_ns=time.time_ns() - 100 * 10**9)
+            until(lambda: "no_tool_length" not in after_a_pause(receiver), "the next one")
+            now_s[0] += 400.0
+            assert "no_tool_length" not in codes(receiver.poll())
+            now_s[0] += 110.0
+            assert "no_tool_length" in codes(receiver.poll())
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [

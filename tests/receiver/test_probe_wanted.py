@@ -52,6 +52,21 @@ def test_an_old_answer_is_old() -> None:
             assert receiver.probe_wanted is None
 
 
+def test_a_status_that_waited_while_the_loop_stood_still_is_old() -> None:
+    port, now_s = free_port(), [1000.0]
+
+    def heard_after_a_pause(receiver: Receiver) -> bool:
+        now_s[0] += 7200.0
+        receiver.poll()
+        return receiver._wanted is not None
+
+    with router(port), Receiver(settings(port), clock=lambda: now_s[0]) as receiver, ScriptedService(port) as service:
+        until(lambda: receiver.poll() and receiver.follower.alive and not receiver._status_answers, "the queries' end")
+        service.put_status(**WANTED, time_utc_ns=time.time_ns() - HOUR_NS)
+        until(lambda: heard_after_a_pause(receiver), "the message")
+        assert receiver.probe_wanted is None
+
+
 @pytest.mark.parametrize(
     "payload",
     [
