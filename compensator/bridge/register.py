@@ -6,7 +6,6 @@ unknown outcome, or a write by another program, the offsets continue from the PL
 
 from __future__ import annotations
 
-import math
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -148,10 +147,10 @@ class Register(Registers):
 
     def _rebase(self, values: tuple[float, ...]) -> str:
         offset_um = values[0] / self._per_um
-        largest = self._follower.limits.offset_max_um
-        if not (math.isfinite(offset_um) and abs(offset_um) <= largest):
-            return f"the PLC holds {offset_um:g} µm, beyond {largest:g} µm"
-        self._follower.rebase(offset_um)
+        try:
+            self._follower.rebase(offset_um)
+        except ReceiverError:
+            return f"the PLC holds {offset_um:g} µm, beyond {self._follower.limits.offset_max_um:g} µm"
         return ""
 
     def value(self, offset_um: float) -> float | None:

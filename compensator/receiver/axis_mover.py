@@ -98,12 +98,13 @@ class AxisMover:
         um, slope, from_mm = (math.nan if number is None else number for number in given)
         ends = tuple(um + slope * (place - from_mm) / 1000.0 for place in self.places_mm)
         most = self.limits.offset_max_um
-        if not all(abs(end) <= most for end in ends):  # not for NaN either
+        # A control that holds 32 bits, or adds up steps, has the limit itself a little beyond it.
+        if not all(abs(end) <= most + ARRIVED_UM for end in ends):  # not for NaN either
             raise ReceiverError(
                 f"applied offset = {shown(applied_um)} µm, slope {shown(slope_um_per_m)} µm/m: expected at most "
                 f"offset_max_um = {most:g} at each position; correct the control first"
             )
-        self.ends_um = ends
+        self.ends_um = tuple(max(-most, min(most, end)) for end in ends)
         self.owed_um = 0.0
         if len(ends) == 2:
             self._position_mm = max(self.places_mm[0], min(self.places_mm[1], from_mm))

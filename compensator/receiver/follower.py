@@ -108,13 +108,14 @@ class Follower(Modes[OffsetMessage]):
         ReceiverError
             Where it is not a number within the limits.
         """
-        number = finite(applied_um)
-        if number is None or abs(number) > self.limits.offset_max_um:
+        number, most = finite(applied_um), self.limits.offset_max_um
+        # A control that holds 32 bits, or adds up steps, has the limit itself a little beyond it.
+        if number is None or abs(number) > most + ARRIVED_UM:
             raise ReceiverError(
-                f"applied offset = {shown(applied_um)} µm: expected at most offset_max_um = "
-                f"{self.limits.offset_max_um:g}; correct the control first"
+                f"applied offset = {shown(applied_um)} µm: expected at most offset_max_um = {most:g}; "
+                f"correct the control first"
             )
-        self.applied_um = number
+        self.applied_um = max(-most, min(most, number))
 
     # ------------------------------------------------------------------ messages
 

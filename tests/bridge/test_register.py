@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensator.bridge.register import Register
-from compensator.receiver import Follower, Limits
+from compensator.bridge.register import AxesRegisters, AxisPlace, Register, single_precision
+from compensator.receiver import AxesFollower, AxisLimits, Follower, Limits
+from compensator.receiver.axes_applied import NOTHING_READ
+from compensator.receiver.limits import Acceptance
 from tests.receiver.offsets import MACHINE, offset
 
 LIMITS = Limits(offset_max_um=50.0, offset_rate_max_um_per_min=60.0, step_max_s=2.0)
@@ -66,6 +68,41 @@ def test_somebody_elses_write_stops_it_until_that_stands() -> None:
     assert r.check(11.1, 0.020) and r._follower.applied_um == pytest.approx(20.0)
     r.wrote(0.020)
     assert not r.check(12.0, math.nan) and not r.check(30.0, math.nan) and "nan" in r.trouble
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_stands_at_its_limit_is_continued(sign: int) -> None:
+    """As 32 bits hold 0.1 mm, it is 100.0000015 µm."""
+    limits = Limits(offset_max_um=100.0, offset_rate_max_um_per_min=60.0)
+    r = Register(Follower(MACHINE, limits), sign=sign, unit_um=1000.0, tolerance_um=0.1, resume_after_s=5.0)
+    value = r.value(100.0)
+    assert value is not None and abs(value) > 0.1
+    assert r.check(0.0, value) and not r.trouble and r._follower.applied_um == 100.0
+    assert r.value(100.0) is None
+    r.lost("gone")
+    assert not r.check(1.0, sign * 0.10002) and "[plc_beyond_limit]" in r.trouble
+
+
+@pytest.mark.parametrize("end_mm", [-500.0, 500.0])
+def test_a_line_that_stands_at_its_limit_is_continued(end_mm: float) -> None:
+    limits = AxisLimits(
+        offset_max_um=100.0,
+        offset_rate_max_um_per_min=60.0,
+        slope_max_um_per_m=60.0,
+        position_min_mm=-500.0,
+        position_max_mm=500.0,
+        position_speed_max_mm_per_s=100.0,
+    )
+    follower = AxesFollower(MACHINE, {"y": limits}, None, Acceptance())
+    place = AxisPlace(sign=1, per_um=1e-3, per_slope=1e-6, tolerance_um=0.1, travel_mm=1000.0)
+    r = AxesRegisters(follower, {"y": place}, 5.0)
+    slope = math.copysign(50.0, end_mm)  # 100 µm at this end
+    values = (single_precision(0.075), single_precision(slope * 1e-6))
+    assert r.check_all(0.0, values) and not r.trouble
+    ends_um = follower.advance(0.0, NOTHING_READ).axes["y"].ends_um
+    assert max(ends_um) == 100.0 and min(ends_um) == pytest.approx(50.0)
+    r.lost("gone")
+    assert not r.check_all(1.0, (0.07502, values[1])) and "[plc_beyond_limit]" in r.trouble
 
 
 actions = st.one_of(
