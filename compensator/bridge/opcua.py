@@ -39,7 +39,6 @@ class Bridge(PlcClient):
         super().__init__(settings, receiver, report)
         self._settings = settings
         self._receiver = receiver
-        self._nodes: dict[str, TypedNode] = {}
         self.register = Register(
             receiver.follower,
             sign=settings.sign,
@@ -105,7 +104,6 @@ class AxesBridge(PlcClient):
         self._at_mm = {axis: place.reference_mm for axis, place in places.items()}
         self._server: Any = None
         self._values: list[TypedNode] = []
-        self._nodes: dict[str, TypedNode] = {}
 
     async def _prepare(self, client: Client) -> None:
         self._server = client

@@ -28,8 +28,8 @@ log = logging.getLogger("compensator")
 TypedNode = tuple[Any, ua.VariantType]
 #: Values of `state_node`: the follower's states, and 4 if nothing may be written.
 STATES = ("starting", "following", "holding", "fading", "trouble")
-#: The counter of `heartbeat_node` fits into every integer of a PLC.
-HEARTBEAT_MODULUS = 2**15
+#: The counter of `heartbeat_node` fits into every integer of a PLC but a Byte, which has its own.
+HEARTBEAT_MODULUS, BYTE_MODULUS = 2**15, 2**8
 REALS = (ua.VariantType.Float, ua.VariantType.Double)
 INTEGERS = (
     ua.VariantType.Byte,
@@ -67,6 +67,7 @@ class PlcClient(ABC):
         self._report = report
         self._reported = ""
         self._beat = 0
+        self._nodes: dict[str, TypedNode] = {}
         self._served = False
 
     @abstractmethod
@@ -129,7 +130,8 @@ class PlcClient(ABC):
             self._modes.hold()
 
     def _next_beat(self) -> int:
-        self._beat = (self._beat + 1) % HEARTBEAT_MODULUS
+        _, kind = self._nodes.get("heartbeat_node", (None, None))
+        self._beat = (self._beat + 1) % (BYTE_MODULUS if kind is ua.VariantType.Byte else HEARTBEAT_MODULUS)
         return self._beat
 
     def _state(self, applied: Applied | AppliedAxes) -> int:

@@ -11,8 +11,14 @@ logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
 class Plc:
-    def __init__(self, port: int, value: float = 0.0, kind: ua.VariantType = ua.VariantType.Float) -> None:
-        self.port, self.start, self.kind = port, value, kind
+    def __init__(
+        self,
+        port: int,
+        value: float = 0.0,
+        kind: ua.VariantType = ua.VariantType.Float,
+        heartbeat: ua.VariantType = ua.VariantType.Int16,
+    ) -> None:
+        self.port, self.start, self.kind, self.heartbeat_kind = port, value, kind, heartbeat
         self.endpoint = f"opc.tcp://127.0.0.1:{port}/"
         self.values: list[float] = []
         self.server: Any = None
@@ -32,7 +38,7 @@ class Plc:
             return node
 
         self.offset = await add("/Plc/DB100.DBD0:REAL", self.start, self.kind)
-        self.heartbeat = await add("/Plc/DB100.DBW4", 0, ua.VariantType.Int16)
+        self.heartbeat = await add("/Plc/DB100.DBW4", 0, self.heartbeat_kind)
         self.state = await add("/Plc/DB100.DBW6", 0, ua.VariantType.UInt16)
         self.enable = await add("/Plc/DB100.DBX8.0", True, ua.VariantType.Boolean)
         self.probe_wanted = await add("/Plc/DB100.DBX8.1", False, ua.VariantType.Boolean)

@@ -198,6 +198,22 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkey
                     await Bridge(opcua, receiver, said.append).run(asyncio.Event())
 
 
+@pytest.mark.parametrize(("kind", "last"), [("Byte", 255), ("Int16", 32767), ("UInt16", 32767)])
+async def test_the_heartbeat_begins_again_before_its_node_is_full(tmp_path: Path, kind: str, last: int) -> None:
+    said: list[str] = []
+    async with (
+        Plc(free_port(), heartbeat=ua.VariantType[kind]) as plc,
+        bridging(written(tmp_path, plc.endpoint, free_port()), said) as bridge,
+    ):
+        bridge._beat = last - 2
+
+        async def is_over() -> bool:
+            return await plc.heartbeat.read_value() in range(1, 100) or any("trouble" in line for line in said)
+
+        await until(is_over, "the end of the count")
+        assert not any("trouble" in line for line in said), said
+
+
 def _applied_um(folder: Path) -> float | None:
     return applied_at(folder / "applied.txt", time.time_ns())
 
