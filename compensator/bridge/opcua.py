@@ -77,6 +77,9 @@ class Bridge(PlcClient):
                 await nodes[key][0].write_value(data_value(number, nodes[key][1]))
         self._report_change(applied)
 
+    def _record_unknown(self) -> None:
+        self._receiver.record(None)
+
 
 class AxesBridge(PlcClient):
     """Writes the offsets and slopes of several axes to a PLC: all in one call, then state and heartbeat.
@@ -142,6 +145,9 @@ class AxesBridge(PlcClient):
         shown["heartbeat_node"] = self._next_beat()
         await self._write([(self._nodes[key], value) for key, value in shown.items() if key in self._nodes])
         self._report_change(applied)
+
+    def _record_unknown(self) -> None:
+        self._receiver.record({})
 
     async def _read(self) -> tuple[tuple[float, ...], dict[str, Any]]:
         """Read all in one call; a length or a signal that the server marks as bad is not there."""

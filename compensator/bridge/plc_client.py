@@ -78,6 +78,10 @@ class PlcClient(ABC):
     async def _cycle(self) -> None:
         """Read, compare and write once."""
 
+    @abstractmethod
+    def _record_unknown(self) -> None:
+        """Record for probes that it is not known what the PLC has."""
+
     async def run(self, stop: asyncio.Event) -> None:
         """Run until `stop` is set; the PLC then keeps its value.
 
@@ -94,6 +98,7 @@ class PlcClient(ABC):
                 if isinstance(error, ConfigError) and not self._served:
                     raise
                 figures = f"{self._connection.endpoint}: {type(error).__name__} {error}".rstrip(". ")
+                self._record_unknown()  # or the record would be interpolated over what nobody has seen
                 self.register.lost(Remark(BridgeTrouble.PLC_NOT_REACHED, f"{figures}.").marked)
             await self._wait_disconnected(stop)
 

@@ -164,6 +164,8 @@ async def test_all_axes_to_the_data_block_or_none(tmp_path: Path, monkeypatch: p
             await plc.z.set_writable(False)
             publish(4, 10.0, -4.0, 20.0)
             await until(lambda: says("[plc_not_reached]"), "refused")
+            for name in ("applied.txt", "applied-z.txt"):
+                assert " -\n" in (tmp_path / name).read_text()  # nobody knows what was written
             beat = await plc.heartbeat.read_value()
             await asyncio.sleep(6 * CYCLE_S)
             assert await plc.heartbeat.read_value() == beat

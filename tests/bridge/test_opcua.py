@@ -179,6 +179,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkey
                 await until(lambda: at(25.0), "it goes on")
                 check(plc.values[count:])
             await until(lambda: asyncio.sleep(0, said[-1].startswith("trouble: opc.tcp")), "the server is gone")
+            assert (tmp_path / "applied.txt").read_text().endswith(" -\n")  # what it has now is not known
             service.put(4, -10.0)
             again = Plc(plc.port, value=0.04)
             async with again:  # restarted, holding something else
