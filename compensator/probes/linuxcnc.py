@@ -79,14 +79,15 @@ class ProbeFile:
         if content is None:
             return
         # Opened anew it is empty until the probe touches, which takes longer than a poll. The same content again is
-        # therefore no new probe.
+        # therefore no new probe, and another one that was never empty may have lines of any time: somebody edited it.
         begin = len(self._known) if content.startswith(self._known) else 0
+        late = late or (begin == 0 and self._known != b"")
         self._known = content
         for line in content[begin:].split(b"\n")[:-1]:
             self._handle(line.decode("ascii", "replace"), late)
 
     def _content(self) -> bytes | None:
-        """Return the whole lines of the file; None if it cannot be read."""
+        """Return the whole lines of the file; None if it cannot be read, or holds no more than half a line."""
         try:
             content = read_file(self._path, LONGEST)
         except FileNotFoundError:
@@ -98,7 +99,7 @@ class ProbeFile:
                 self._report(lost(self._path, why))
             return None
         self._trouble = ""
-        return content[: content.rfind(b"\n") + 1]
+        return content[: content.rfind(b"\n") + 1] if not content or b"\n" in content else None
 
     def _handle(self, line: str, late: bool) -> None:
         settings, now_utc_ns = self._settings, self._utc_ns()

@@ -82,12 +82,29 @@ def test_appended_opened_anew_and_the_same_again(tmp_path: Path) -> None:
     bench.write(line(50.002), "a")
     bench.write("")
     bench.write(line(50.002))  # the same value after it was opened anew: a probe
+    bench.write("")
     bench.write(line(50.003))
     assert [round(probe.measured_um + 8.0, 3) for probe in bench.probes] == [-1.0, -2.0, -2.0, -3.0]
     os.utime(bench.path)
     bench.file.poll()
     bench.write(line(50.003))  # the same file again: no probe
     assert len(bench.probes) == 4
+
+
+@pytest.mark.parametrize("first", ["", line(50.002)[:30]])
+def test_a_file_that_was_edited_has_lines_of_any_time(tmp_path: Path, first: str) -> None:
+    bench = Bench(tmp_path)
+    bench.write(line(50.001) + line(50.002))
+    if first:  # seen while it is written
+        bench.write(first)
+    bench.write(line(50.002))
+    assert len(bench.probes) == 2 and ["[line_age_unknown]" in report for report in bench.reports] == [True]
+    bench.write(line(50.003), "a")
+    assert len(bench.probes) == 3 and len(bench.reports) == 1
+    bench.path.unlink()
+    bench.file.poll()
+    bench.write(line(50.004))
+    assert len(bench.probes) == 4 and len(bench.reports) == 1
 
 
 def test_half_a_line_waits(tmp_path: Path) -> None:
