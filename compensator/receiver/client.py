@@ -120,7 +120,7 @@ class Client(ABC):
         self._offset_key, self._latest_keys = offset_key, latest_keys
         self._state_file = Path(source.state_file) if source.state_file else None
         self._remark: Reason | None = None
-        self._record_remark: Reason | None = None
+        self._not_recorded: dict[AppliedRecord, Reason] = {}
         self._wanted: tuple[ProbeWanted | None, int, float] | None = None
         self._polled_s: float | None = None
         self._paused = False
@@ -192,7 +192,7 @@ class Client(ABC):
     @property
     def _remarks(self) -> tuple[Reason, ...]:
         """Return what does not concern the offset."""
-        own = (self._remark, self._record_remark, None if self.connected else _CONNECTING)
+        own = (self._remark, *dict.fromkeys(self._not_recorded.values()), None if self.connected else _CONNECTING)
         return tuple(reason for reason in own if reason is not None)
 
     def _receive(self, now_s: float, sample: Any, *, check_age: bool, asked: bool) -> None:
@@ -214,9 +214,9 @@ class Client(ABC):
         try:
             record.append(self._utc_ns(), applied_um)
         except OSError as error:
-            self._record_remark = Reason("applied_not_recorded", f"{error.strerror or error}")
+            self._not_recorded[record] = Reason("applied_not_recorded", f"{error.strerror or error}")
         else:
-            self._record_remark = None
+            self._not_recorded.pop(record, None)
 
     @property
     def probe_wanted(self) -> ProbeWanted | None:

@@ -164,6 +164,17 @@ def test_a_stranger_that_answers_with_thousands_of_keys_holds_up_no_offset(tmp_p
             service.close()
 
 
+@pytest.mark.parametrize("name", ["applied.txt", "applied-z.txt"])
+def test_an_axis_that_is_recorded_hides_none_that_is_not(tmp_path: Path, name: str) -> None:
+    receiver = AxesReceiver(loaded(written(tmp_path)))
+    (tmp_path / name).mkdir()
+    receiver.record({"y": 1.0, "z": 2.0})
+    assert "applied_not_recorded" in codes(receiver.poll())
+    (tmp_path / name).rmdir()
+    receiver.record({"y": 2.0, "z": 3.0})
+    assert "applied_not_recorded" not in codes(receiver.poll())
+
+
 def test_a_length_that_waited_while_the_loop_stood_still_is_as_old_as_it_is(tmp_path: Path) -> None:
     port, now_s = free_port(), [1000.0]
 
