@@ -38,6 +38,9 @@ class AxisView:
         µm for each count.
     request_um, eoffset_um : float
         Sum that LinuxCNC has accepted, and how far it has moved.
+    acts : bool
+        Whether the axis has its offset. It has none while the machine is off, not homed or cleared, when the pins show
+        an old one. In joint mode and without `eoffset-enable` it acts, although no change of it is taken.
     ready : bool
         Whether a change of the counts is taken and moves the axis at once.
     limited : bool
@@ -48,6 +51,7 @@ class AxisView:
     scale_um: float
     request_um: float
     eoffset_um: float
+    acts: bool
     ready: bool
     limited: bool
 

@@ -136,12 +136,9 @@ class Axis:
         """Read the axis."""
         pin, unit = self.name, self._unit_um
         moves = hal.get_value("motion.teleop-mode") or hal.get_value("motion.coord-mode")
-        # In joint mode a change is accepted, and moves the axis at its own speed when the mode is left.
-        ready = bool(
+        acts = bool(
             hal.get_value("motion.motion-enabled")
             and hal.get_value("motion.is-all-homed")
-            and moves
-            and hal.get_value(f"{pin}.eoffset-enable")
             and not hal.get_value(f"{pin}.eoffset-clear")
         )
         return AxisView(
@@ -149,22 +146,16 @@ class Axis:
             scale_um=hal.get_value(f"{pin}.eoffset-scale") * unit,
             request_um=hal.get_value(f"{pin}.eoffset-request") * unit,
             eoffset_um=hal.get_value(f"{pin}.eoffset") * unit,
-            ready=ready,
+            acts=acts,
+            # In joint mode a change is accepted, and moves the axis at its own speed when the mode is left.
+            ready=bool(acts and moves and hal.get_value(f"{pin}.eoffset-enable")),
             limited=bool(hal.get_value("motion.eoffset-limited")),
         )
 
     def found_um(self) -> float:
-        """Return the offset that the axis has already.
-
-        It is 0 while the machine is off, not homed or cleared, when the pins show an old one. In joint mode and without
-        `eoffset-enable` it acts, although no change of it is taken.
-        """
-        acts = (
-            hal.get_value("motion.motion-enabled")
-            and hal.get_value("motion.is-all-homed")
-            and not hal.get_value(f"{self.name}.eoffset-clear")
-        )
-        return self.view().request_um if acts else 0.0
+        """Return the offset that the axis has already."""
+        view = self.view()
+        return view.request_um if view.acts else 0.0
 
 
 class Output:
@@ -209,7 +200,7 @@ class Output:
         there = view.ready and abs(view.eoffset_um - applied.offset_um) <= view.scale_um
         self.arrived = applied.arrived and there
         component[f"{prefix}offset-um"] = applied.offset_um
-        component[f"{prefix}applied-um"] = view.eoffset_um if view.ready else 0.0
+        component[f"{prefix}applied-um"] = view.eoffset_um if view.acts else 0.0
         if prefix:
             component[f"{prefix}state"] = STATES.index(applied.state)
             component[f"{prefix}arrived"] = self.arrived

@@ -129,6 +129,7 @@ def _start(bench: Bench, service: ScriptedService) -> None:
         service.put(2, -2.0)
         until(lambda: abs(bench.pin("offset-um") + 2.0) < 0.01, "the component has it")
         assert abs(control.um("axis.y.eoffset-request") - 5.0) < 0.01 and not bench.pin("ready")
+        assert abs(bench.pin("applied-um") - 5.0) < 0.01
         control.do("teleop")
         bench.arrive(-2.0)
     still(periods)

@@ -49,6 +49,7 @@ class Axis:
             scale_um=SCALE_UM,
             request_um=self.request_um,
             eoffset_um=self.eoffset_um,
+            acts=self.on and not self.clear,
             ready=self.ready,
             limited=False,
         )
