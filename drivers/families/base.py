@@ -206,6 +206,8 @@ class ModbusDevice(Module[Check]):
         self._polls = tuple(polls)
         fence = fence_for((*self._polls, *(check.request for check in checks)))
         super().__init__(config.name, units, line.join(config.name, config.address, fence), checks)
+        self._absent: list[Check] = []
+        self._absent_on: int | None = None
 
     def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
         """Convert the answers to the polls to readings."""
@@ -220,12 +222,19 @@ class ModbusDevice(Module[Check]):
         return await self._member.registers(request)
 
     async def _check(self, check: Check) -> Sequence[Check]:
+        # On a serial line a refusal puts the device out of sync, after which it is verified again: what it does not
+        # have would be asked for at every read.
+        if self._absent_on != self._member.line.generation:
+            self._absent, self._absent_on = [], self._member.line.generation
+        if check in self._absent:
+            return ()
         try:
             answer = await self._request(check.request)
         except ModbusRefused as error:
             if error.exception_code not in _NOT_THERE:
                 raise
             LOG.info("%s: %s cannot be verified: %s", self._name, check.what, error.message)
+            self._absent.append(check)
             return ()
         for place, expected in check.expected.items():
             found = answer[place] & check.mask

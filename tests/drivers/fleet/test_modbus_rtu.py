@@ -79,6 +79,19 @@ async def test_adam_says_another_type(rig: Any, slave: Any, register: tuple[int,
     assert text in str(caught.value)
 
 
+async def test_a_register_that_the_module_does_not_have_is_asked_for_once(rig: Any, slave: Any) -> None:
+    unit = made(slave)
+    for register in range(200, 208):
+        del unit.registers[3, register]
+    _, _, [device] = await rig.modbus({1: unit}, adam(verify=True), rtu=True)
+    for _ in range(4):
+        assert (await device.read())[0].value == pytest.approx(degc(OLD))
+    assert unit.requests.count((3, 200, 8)) == 1
+    unit.requests.clear()
+    await device.read()
+    assert unit.requests == [(3, 0, 8), (1, 0, 8)]
+
+
 @pytest.mark.parametrize("lost", [1, 2, 3])
 async def test_late_answer_is_not_taken_for_a_later_one(rig: Any, slave: Any, lost: int) -> None:
     """Every answer is late by up to three requests, and all of them come just before the next one is due."""
