@@ -124,7 +124,7 @@ class DconModule(Module[str]):
                     self._check_type("$AA2", number, int(answer[:2], 16))
             return []
         number = int(check[2:], 16)
-        self._check_type(f"$AA{check}", number, self._number(answer, r"C[0-9A-F]R([0-9A-F]{2})", f"$AA{check}"))
+        self._check_type(f"$AA{check}", number, self._number(answer, rf"C{number:X}R([0-9A-F]{{2}})", f"$AA{check}"))
         return []
 
     def _check_format(self, flags: int) -> None:

@@ -136,6 +136,13 @@ async def test_what_the_module_says_must_agree(rig: Any, replies: dict[str, str]
         await device.read()
 
 
+async def test_a_type_of_another_input_is_no_answer(rig: Any) -> None:
+    replies = {"$M": "4018P", "$2": "000600", "$8C0": "C1R0F"}
+    _, _, [device] = made(rig, {1: Module(NEW, **replies)}, table(verify=True))
+    with pytest.raises(DeviceGarbled, match=r"\$AA8C0 answers 'C1R0F', expected C0R"):
+        await device.read()
+
+
 async def test_verification_takes_what_there_is(rig: Any) -> None:
     replies = {"$M": "4018P", "$2": "000600", "$8C0": "C0R0F"}
     bus, _, [one, two] = made(
