@@ -140,7 +140,7 @@ class WatchedFolder:
             paths = sorted(folder.glob(self._settings.pattern))
             if not folder.is_dir():
                 raise FileNotFoundError(2, "no such folder")
-        except OSError as error:
+        except (OSError, ValueError) as error:  # of a pattern
             self._trouble(folder, error)
             return
         for path in paths:
@@ -221,7 +221,7 @@ class WatchedFolder:
         self._handled.add(line)
         self._pending.pop(line.identity, None)
 
-    def _trouble(self, path: Path, error: OSError | UsageError) -> None:
+    def _trouble(self, path: Path, error: OSError | UsageError | ValueError) -> None:
         self._once(path, lost(path, getattr(error, "strerror", None) or error))
 
     def _refuse(self, path: Path, code: ProbeSourceRemark, text: str, why: str) -> None:

@@ -248,7 +248,7 @@ def _folder(path: Path, table: Mapping[str, Any]) -> Folder:
     folder = read_table(Folder, table, source=str(path), name="folder")
     _check_sign(f"{path}: folder", folder)
     _within(folder, {"poll_s": (0.02, 600.0)}, f"{path}: folder")
-    if not folder.pattern or "/" in folder.pattern:
+    if set(folder.pattern) <= {"."} or "/" in folder.pattern or "**" in folder.pattern:  # "." is the folder itself
         raise ReceiverError(f"{path}: folder.pattern = {folder.pattern!r}: expected a name such as '*.csv'")
     return replace(folder, path=_absolute(path, folder.path))
 

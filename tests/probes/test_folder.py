@@ -44,13 +44,17 @@ class Bench:
         self.answers = True
         self.minute = 2.0
         self.applied_um = applied_um
-        self.sign, self.includes_offset = 1, False
+        self.sign, self.includes_offset, self.pattern = 1, False, "*.csv"
         self.restart()
 
     def restart(self) -> None:
         self.watched = WatchedFolder(
             Folder(
-                path=str(self.folder), sign=self.sign, sign_checked="simulated", includes_offset=self.includes_offset
+                path=str(self.folder),
+                pattern=self.pattern,
+                sign=self.sign,
+                sign_checked="simulated",
+                includes_offset=self.includes_offset,
             ),
             Handled(self.state, 90000.0),
             self._submit,
@@ -96,6 +100,14 @@ def test_a_line_becomes_a_probe_with_its_own_time(tmp_path: Path) -> None:
         )
     ]
     assert not bench.reports
+
+
+def test_a_pattern_that_python_does_not_take_is_said_once_and_ends_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.pattern = "**.csv"
+    bench.restart()
+    bench.write(HEADER + line(1.5))
+    assert not bench.probes and len(bench.reports) == 1 and "[source_lost]" in bench.reports[0]
 
 
 def test_each_line_once_over_appending_rewriting_copies_and_restarts(tmp_path: Path) -> None:

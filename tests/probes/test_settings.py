@@ -67,6 +67,8 @@ def test_all_sources_with_absolute_paths(tmp_path: Path) -> None:
         ('"probes-state.json"', '"probes.toml"', "probes.toml': is the file with these settings, expected a file"),
         ('path = "in"', "", "folder.path: missing"),
         ('path = "in"', 'path = "in"\npattern = "a/*.csv"', "folder.pattern"),
+        ('path = "in"', 'path = "in"\npattern = "**.csv"', "folder.pattern"),
+        ('path = "in"', 'path = "in"\npattern = "."', "folder.pattern"),
         ("sign = 1\nsign_checked", "sign_checked", "missing; determine the sign on this machine by probing"),
         ("sign = -1\nsign_checked", "sign_checked", "dprnt.sign: missing; determine the sign"),
         ("sign = -1\nsign_checked", "sign = -2\nsign_checked", "dprnt.sign = -2: expected 1 or -1"),
