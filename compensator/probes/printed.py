@@ -95,7 +95,7 @@ class PrintedProbes:
         settings = self._settings
         time_utc_ns = now_utc_ns - round((settings.delay_s + printed.age_s) * 1e9)
         if printed.printed_at is not None:
-            printed_ns = self._utc_ns(printed.printed_at)
+            printed_ns = self._utc_ns(printed.printed_at, now_utc_ns)
             difference_s = (now_utc_ns - printed_ns) / 1e9
             if abs(difference_s) > settings.clock_tolerance_s:
                 order = "before" if difference_s > 0.0 else "after"
@@ -122,8 +122,10 @@ class PrintedProbes:
             )
         )
 
-    def _utc_ns(self, at: datetime.datetime) -> int:
-        return int(at.replace(tzinfo=self._zone).timestamp()) * 1_000_000_000
+    def _utc_ns(self, at: datetime.datetime, now_utc_ns: int) -> int:
+        """Return the printed time; of the hour that comes twice at the end of summer time, the one that is nearer."""
+        both = [int(at.replace(tzinfo=self._zone, fold=fold).timestamp()) * 1_000_000_000 for fold in (0, 1)]
+        return min(both, key=lambda time_utc_ns: abs(now_utc_ns - time_utc_ns))
 
     def _note_foreign(self, text: str) -> None:
         self._foreign += 1

@@ -45,8 +45,8 @@ class Bench:
         self.asked.append(time_utc_ns)
         return self.applied_um
 
-    def receive(self, data: bytes, *, late: bool = False) -> None:
-        self.printed.receive(data, 0.0, NOW_NS, late=late)
+    def receive(self, data: bytes, *, late: bool = False, now_ns: int = NOW_NS) -> None:
+        self.printed.receive(data, 0.0, now_ns, late=late)
 
 
 @pytest.mark.parametrize("includes_offset", [False, True])
@@ -90,6 +90,15 @@ def test_a_time_in_the_line_is_kept_and_checked() -> None:
                 assert bench.probes[0].time_utc_ns == NOW_NS - (seconds + 2) * 1_000_000_000
             else:
                 assert "[line_clock_disagrees]" in bench.reports[0]
+
+
+@pytest.mark.parametrize("utc_h", [0, 1])
+def test_the_hour_that_comes_twice_is_the_one_that_is_now(utc_h: int) -> None:
+    now = datetime.datetime(2026, 10, 25, utc_h, 30, 0, tzinfo=datetime.UTC)  # both are 02:30 in Prague
+    bench = Bench(replace(SETTINGS, zone="Europe/Prague"))
+    now_ns = int(now.timestamp()) * 1_000_000_000
+    bench.receive(LINE.replace(b"END", b"D20261025 H 23000 END"), now_ns=now_ns)
+    assert [probe.time_utc_ns for probe in bench.probes] == [now_ns] and not bench.reports
 
 
 def test_what_waited_somewhere_is_refused() -> None:
