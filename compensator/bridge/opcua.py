@@ -13,7 +13,7 @@ from compensator.bridge.plc_client import INTEGERS, REALS, PlcClient, TypedNode,
 from compensator.bridge.register import AxesRegisters, Register
 from compensator.bridge.settings import OpcUa
 from compensator.receiver import AxesReceiver, ControlState, Receiver
-from compensator.receiver.subscriber import monotonic_s
+from compensator.receiver.client import monotonic_s
 
 _BOOLS = (ua.VariantType.Boolean,)
 #: Nodes that show how the bridge is, and what a PLC says to it.

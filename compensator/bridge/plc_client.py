@@ -20,7 +20,7 @@ from compensator.codes import BridgeTrouble, Remark
 from compensator.errors import ConfigError
 from compensator.input_file import KEY_BYTES, read_file
 from compensator.receiver import Applied, AppliedAxes, AxesReceiver, Receiver
-from compensator.receiver.subscriber import monotonic_s
+from compensator.receiver.client import monotonic_s
 
 log = logging.getLogger("compensator")
 

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from compensator.errors import ConfigError, one_line
 from compensator.input_file import KEY_BYTES, read_file, resolved
-from compensator.receiver import ReceiverError, Settings, load_settings
+from compensator.receiver import ReceiverError
 from compensator.receiver.settings import read_table, require_sign
 
 if TYPE_CHECKING:
@@ -97,28 +97,13 @@ class OpcUa(Connection):
     sign_checked: str
 
 
-def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
-    """Read and check a bridge's file; nothing is opened.
-
-    Raises
-    ------
-    ConfigError
-        One line that names file, key, value and what was expected.
-    """
-    try:
-        receiver, tables = load_settings(path)
-        return receiver, opcua_from(tables, str(path))
-    except ReceiverError as error:
-        raise ConfigError(str(error)) from error
-
-
 def opcua_from(tables: dict[str, Any], path: str) -> OpcUa:
     """Check the tables beside `[receiver]` of one axis.
 
     Raises
     ------
     ConfigError, ReceiverError
-        As `load_bridge`.
+        One line that names file, key, value and what was expected.
     """
     table = opcua_table(tables, path, "receiver, opcua")
     require_sign(table, f"{path}: opcua", how=SIGN_BY)

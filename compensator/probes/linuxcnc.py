@@ -18,7 +18,7 @@ from compensator.probes.probe import Probe
 from compensator.probes.reports import Report, lost, not_sent
 from compensator.probes.sender import pause
 from compensator.probes.settings import UNITS_UM, LinuxCnc, convention
-from compensator.receiver.subscriber import monotonic_s
+from compensator.receiver.client import monotonic_s
 
 NUMBERS = 9
 #: Column of the axis, Y.

@@ -17,7 +17,7 @@ from compensator.probes.printed import PrintedProbes
 from compensator.probes.reports import Report, lost
 from compensator.probes.sender import pause
 from compensator.probes.settings import Dprnt, address_of
-from compensator.receiver.subscriber import monotonic_s
+from compensator.receiver.client import monotonic_s
 
 _CHUNK = 4096
 #: How often the loop shows that it runs, s.

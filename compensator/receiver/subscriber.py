@@ -17,8 +17,6 @@ from .message import OffsetMessage
 from .modes import Modes
 from .settings import Settings
 
-__all__ = ["Receiver", "monotonic_s"]
-
 
 class Receiver(Client):
     """Receives the offset of one machine. Use it as a context manager, and call `poll` in your loop.

@@ -32,7 +32,7 @@ from compensator.receiver import (
     Settings,
     load_any,
 )
-from compensator.receiver.subscriber import monotonic_s
+from compensator.receiver.client import monotonic_s
 
 PERIOD_S = 0.01
 

@@ -19,12 +19,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 
+from compensator.bridge.axes_settings import load_any_bridge
 from compensator.bridge.opcua import Bridge
 from compensator.bridge.plc_client import real
-from compensator.bridge.settings import load_bridge
+from compensator.bridge.settings import OpcUa
 from compensator.cli import main
 from compensator.errors import ConfigError
-from compensator.receiver import Receiver
+from compensator.receiver import Receiver, Settings
 from compensator.receiver.applied_record import applied_at
 from tests.bridge.plc import Plc
 from tests.receiver.wire import ScriptedService, free_port, router
@@ -102,9 +103,15 @@ def refused(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
+def loaded(path: Path) -> tuple[Settings, OpcUa]:
+    receiver, opcua = load_any_bridge(path)
+    assert isinstance(receiver, Settings) and isinstance(opcua, OpcUa)
+    return receiver, opcua
+
+
 @asynccontextmanager
 async def bridging(path: Path, said: list[str]) -> AsyncIterator[Bridge]:
-    settings, opcua = load_bridge(path)
+    settings, opcua = loaded(path)
     stop = asyncio.Event()
     with Receiver(settings, step_max_s=2.0 * opcua.cycle_s) as receiver:
         bridge = Bridge(opcua, receiver, said.append)
@@ -191,7 +198,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkey
                 await until(lambda: asyncio.sleep(0, "no reliable offset" in said[-1]), "it is said")
                 assert await _near(again, 10.0)
                 integer = {"/Plc/DB100.DBD0:REAL": "/Plc/DB100.DBW6"}
-                settings, opcua = load_bridge(written(tmp_path, plc.endpoint, zenoh, **integer))
+                settings, opcua = loaded(written(tmp_path, plc.endpoint, zenoh, **integer))
                 with (
                     Receiver(settings) as receiver,
                     pytest.raises(ConfigError, match="a UInt16, expected one of Float"),
@@ -317,7 +324,7 @@ def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_the_trial_without_a_plc_can_be_loaded() -> None:
-    settings, opcua = load_bridge(Path(__file__).parents[2] / "deploy/opcua/trial.toml")
+    settings, opcua = loaded(Path(__file__).parents[2] / "deploy/opcua/trial.toml")
     assert (settings.prefix, opcua.offset_node, opcua.unit) == ("shop/vmc-07", "ns=2;i=2", "um")
 
 
