@@ -199,7 +199,8 @@ class WatchedFolder:
         if offset_um is None:
             offset_um = self._applied_at(line.time_utc_ns)
         if offset_um is None:
-            self._refuse(path, ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no offset_applied_um")
+            why = "no offset_applied_um, and no record of the offset at this time"
+            self._refuse(path, ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, why)
             return False
         self._pending[line.identity] = line.values
         self._submit(self._probe(line, offset_um), path.name, lambda _: self._done(line))

@@ -107,7 +107,7 @@ class PrintedProbes:
         if offset_um is None:
             offset_um = self._applied_at(time_utc_ns)
         if offset_um is None:
-            self._refuse(ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no O")
+            self._refuse(ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no O, and no record of the offset at this time")
             return
         self._refused = 0
         measured_um = convention(settings).measured_um(printed.reading_um, offset_um)

@@ -118,7 +118,8 @@ def test_the_offset_comes_from_the_receivers_record_at_the_time_of_the_touch() -
     assert bench.probes[0].offset_applied_um == 7.5 and bench.asked == [NOW_NS - 10_500_000_000]
     bench = Bench(applied_um=None)
     bench.receive(line)
-    assert not bench.probes and "[line_offset_unknown]" in bench.reports[0]
+    (report,) = bench.reports
+    assert not bench.probes and "[line_offset_unknown]" in report and "no record of the offset at this time" in report
 
 
 def test_a_feature_is_needed() -> None:
