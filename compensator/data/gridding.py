@@ -33,6 +33,8 @@ _TEMPERATURE, _APART = (850.0, 1370.0, 1372.0, 1768.0, -200.0, -242.0, -270.0), 
 _SHOWN = 3
 #: Temperatures that no model runs without.
 _INPUTS = ("t_q_degc", "at_degc")
+#: Share of a sample's period from which rows apart are one for each sample, and not several.
+_ROW_OF_SAMPLE = 0.75
 #: Share of rows without a temperature, outside long gaps, from which it is remarked on.
 _SPARSE = 0.1
 
@@ -76,11 +78,9 @@ def to_grid(table: Table, period_s: float) -> SampledData:
                 DataRemark.TIMES_EQUAL, f"{table.name}: row {row}: {count} row(s) with the time of another; averaged."
             )
         )
-    slot = (
-        np.round(t_s / period_s).astype(int)
-        if _spacing(t_s) >= period_s
-        else np.floor(t_s / period_s + 1e-9).astype(int)
-    )
+    # A row for each sample goes to the nearest one, whatever its clock's jitter; of several each sample has its own.
+    nearest = _spacing(t_s) > _ROW_OF_SAMPLE * period_s
+    slot = np.floor(t_s / period_s + (0.5 if nearest else 1e-9)).astype(int)
     n = int(slot[-1]) + 1
     columns = {name: _mean_by_slot(slot, values[order], n) for name, values in table.columns.items()}
     present = np.zeros(n, dtype=bool)

@@ -33,6 +33,18 @@ def test_a_table_in_order_has_no_remark(tmp_path: Path) -> None:
     assert remarks(tmp_path / "a.csv", [row(i) for i in range(ROWS)]) == []
 
 
+@pytest.mark.parametrize("second_s", [60.0, 30.0])
+@pytest.mark.parametrize("jitter_s", [0.001, 0.05])
+def test_a_clock_that_jitters_loses_no_sample(jitter_s: float, second_s: float) -> None:
+    """Whether the median of its steps is a little below or above the period, or the first row half a minute early."""
+    for seed in range(4):
+        late_s = np.abs(np.random.default_rng(seed).normal(0.0, jitter_s, ROWS - 1))
+        t_s = np.concatenate(([0.0], second_s + 60.0 * np.arange(ROWS - 1) + late_s))
+        measured = read({"t_s": t_s, "t_q_degc": 0.01 * np.arange(ROWS), "at_degc": np.zeros(ROWS)})
+        [record] = measured.at_period(60.0).records
+        assert np.array_equal(record.columns["t_q_degc"], 0.01 * np.arange(ROWS))
+
+
 def test_rows_with_equal_times_are_counted_and_the_first_is_named(tmp_path: Path) -> None:
     rows = [row(i, t_s=6000.0 if 100 <= i <= 103 else None) for i in range(ROWS)]
     found = remarks(tmp_path / "a.csv", rows)
