@@ -139,7 +139,8 @@ class Part:
     @property
     def y_moved_s(self) -> float:
         """When measured Y last moved by itself, s since 1970; 0 if it has not. A drift goes on to the end."""
-        begin_s, times_s = float(self.table.t_s.min()), [0.0]
+        # A step counts from the first sample with T_Q and AT, which may be after the first row.
+        begin_s, times_s = float(self._times_s[0]), [0.0]
         for effect in self.found.effects:
             if effect.kind == _DRIFT:
                 times_s.append(float(self.table.t_s.max()))

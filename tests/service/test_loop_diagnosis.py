@@ -13,6 +13,7 @@ from compensator.api.loop import Part, _diagnosed, diagnoses_of_table, diagnosis
 from compensator.clock import NS
 from compensator.data.measurement import Measurement
 from compensator.data.table import Table
+from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import usable_table
 from compensator.service.loop.run import LoopRun
@@ -51,6 +52,13 @@ def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate(kn
     assert found.model is None and found.effects == () and "step" in found.needs
     begin_ns = round(float(knocked.table.t_s.min()) * NS)
     assert (found.y_moved_utc_ns - begin_ns) / (60 * NS) == pytest.approx(KNOCKED, abs=3)
+
+
+def test_the_time_of_a_step_is_right_where_a_record_begins_without_t_q(knocked: Part) -> None:
+    t_q_degc = np.where(np.arange(knocked.table.t_s.size) < 300, np.nan, knocked.table.columns["t_q_degc"])
+    table = dataclasses.replace(knocked.table, columns=knocked.table.columns | {"t_q_degc": t_q_degc})
+    part = Part.of(table, parse_model(QUILL, source="test"), None)
+    assert (part.y_moved_s - float(table.t_s.min())) / 60.0 == pytest.approx(KNOCKED, abs=3)
 
 
 @once
