@@ -9,10 +9,10 @@ import pytest
 from compensator.codes import Reason
 from compensator.model.model_file import parse_model
 from compensator.service.compensation import Compensation
-from compensator.service.loop.run import warmed_on
+from compensator.service.loop.run import LoopRun, warmed_on
 from compensator.service.outcome import Outcome, sets_zero_at_rest
 from compensator.service.transfer.shadow import Shadow
-from tests.service.looping import extended, machine, settings, stronger
+from tests.service.looping import QUILL_FILE, Night, extended, machine, settings, shown, stronger
 
 RECORD = 3000
 
@@ -67,7 +67,45 @@ def test_a_pause_in_the_record_counts(record: list[Outcome]) -> None:
 def _moved(sample: Any, i: int) -> Any:
     """The sample as if no other one were missing before it."""
     start_ns = sample.time_utc_ns - sample.seq * 60_000_000_000
-    return msgspec.structs.replace(sample, time_utc_ns=start_ns + i * 60_000_000_000)
+    return msgspec.structs.replace(sample, seq=i, time_utc_ns=start_ns + i * 60_000_000_000)
+
+
+@pytest.mark.parametrize("hours", [3, -1])
+def test_a_clock_that_was_set_is_no_pause(record: list[Outcome], hours: int) -> None:
+    model = parse_model(extended(3.0), source="candidate")
+    later_ns = hours * 3600 * 10**9
+    changed = [
+        msgspec.structs.replace(
+            one, sample=msgspec.structs.replace(one.sample, time_utc_ns=one.sample.time_utc_ns + later_ns)
+        )
+        if one.sample.seq > 5790
+        else one
+        for one in record
+    ]
+    assert predicted(warmed_on(settings(), model, changed)) == predicted(warmed_on(settings(), model, record))
+
+
+@pytest.mark.parametrize("kills", [False, True])
+def test_a_restart_in_the_record_counts_although_numbers_go_on(kills: bool) -> None:
+    """A service that stands still leaves numbers out, one that was off does not; both are told of by `pause`."""
+
+    def first_prediction(left_out: int) -> float:
+        loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+        for one in machine(4000):
+            if 500 <= one.seq < 600:
+                continue
+            if one.seq == 600:
+                loop.pause(100)
+            if one.seq == 650 and kills:
+                state = loop.state()
+                loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+                loop.restore(state)
+            number = one.seq if one.seq < 600 else one.seq - 100 + left_out
+            if candidates := loop.process(msgspec.structs.replace(one, seq=number)).candidates:
+                return candidates[0].y_pred_um
+        raise AssertionError("no candidate")
+
+    assert first_prediction(0) == first_prediction(100)
 
 
 def test_what_a_person_has_seen_to_before_the_candidate_is_no_fault_of_it() -> None:

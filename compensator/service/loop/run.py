@@ -7,11 +7,11 @@ one; its result counts from the next sample on.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 
-from compensator.clock import HOUR_NS, NS
+from compensator.clock import HOUR_NS
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
@@ -61,6 +61,7 @@ class _Saved(msgspec.Struct, kw_only=True):
     compensation: bytes
     attachments: dict[str, bytes]
     record: list[Outcome]
+    pauses: dict[int, int | None] = {}
     at_rest: Outcome | None = None
     warm_utc_ns: int = 0
 
@@ -92,6 +93,8 @@ class LoopRun:
         self._compensation = Compensation(config, model_of(config, model, source="model"))
         self._core = ModelLoop(config, self._compensation.model, {})
         self._record: deque[Outcome] = deque()
+        #: Pauses within the record, in samples, by the number of the sample before; see `pause`.
+        self._pauses: dict[int, int | None] = {}
         #: The last zero at rest, and the time of a later one on a warm machine; 0 without one.
         self._at_rest: Outcome | None = None
         self._warm_ns = 0
@@ -137,6 +140,10 @@ class LoopRun:
         """Account for samples that were not measured, as after a restart; see `Compensation.pause`."""
         # What follows from the last sample comes first: a model that is new stands before the pause, too.
         self._notes = self._between(self._compensation.status.time_utc_ns)
+        if self._record and samples != 0:
+            last = self._record[-1].sample.seq
+            before = self._pauses.get(last, 0)
+            self._pauses[last] = None if samples is None or before is None else before + samples
         self._compensation.pause(samples)
         self._core.pause(samples)
 
@@ -179,6 +186,7 @@ class LoopRun:
             compensation=self._compensation.state(),
             attachments=self._core.attachments(),
             record=list(self._record),
+            pauses=self._pauses,
             at_rest=self._at_rest,
             warm_utc_ns=self._warm_ns,
         )
@@ -202,7 +210,7 @@ class LoopRun:
         self._notes = core.loop.restarted()
         self._compensation, self._core = compensation, core
         self._data, self._calibrated = saved.model, saved.calibrated
-        self._record, self._found = deque(saved.record), None
+        self._record, self._pauses, self._found = deque(saved.record), saved.pauses, None
         self._at_rest, self._warm_ns = saved.at_rest, saved.warm_utc_ns
 
     # ------------------------------------------------------------------ the loop
@@ -222,7 +230,7 @@ class LoopRun:
             if running is not None and weighed.candidate is not None:
                 model = model_of(self._config, weighed.candidate, source="candidate")
                 error = ErrorBlocks()
-                warmed = warmed_on(self._config, model, list(self._record), self._at_rest, error)
+                warmed = warmed_on(self._config, model, list(self._record), self._at_rest, error, self._pauses)
                 notes += core.loop.begin()
                 if core.is_free:
                     core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data), error)
@@ -254,7 +262,7 @@ class LoopRun:
             # The deformation counts from what the model predicts at that zero, so its state must be known there.
             oldest_ns = min(oldest_ns, self._warm_ns - round(warm_up_h * HOUR_NS))
         while self._record[0].sample.time_utc_ns <= oldest_ns:
-            self._record.popleft()
+            self._pauses.pop(self._record.popleft().sample.seq, None)
 
 
 def warmed_on(
@@ -263,6 +271,7 @@ def warmed_on(
     record: Sequence[Outcome],
     at_rest: Outcome | None = None,
     error: ErrorBlocks | None = None,
+    pauses: Mapping[int, int | None] | None = None,
 ) -> Compensation:
     """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
 
@@ -271,11 +280,14 @@ def warmed_on(
     Parameters
     ----------
     record : sequence of Outcome
-        Outcomes in order; what is missing between two of them is a pause.
+        Outcomes in order; numbers that are missing between two of them are a pause.
     at_rest : Outcome, optional
         That of the last zero at rest before the record.
     error : ErrorBlocks, optional
         Gets its errors.
+    pauses : mapping of int to int or None, optional
+        Pauses that are known, in samples, by the number of the sample before. The numbers alone do not show those of a
+        restart, nor do the times where the clock was set.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
@@ -290,8 +302,8 @@ def warmed_on(
             compensation.begin(zero)
     for outcome in record[begin + 1 :]:
         if last is not None:
-            apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
-            compensation.pause(round(apart) - 1)
+            missing = outcome.sample.seq - last.sample.seq - 1
+            compensation.pause((pauses or {}).get(last.sample.seq, missing))
         _, other = shadow.process(outcome)
         if error is not None:
             error.update(other)
