@@ -454,7 +454,8 @@ def _parts(
         rest = np.isfinite(run.y_um) & ~mask
         if rest.any():
             parts.append(_part(run, predicted, rest, "held out", model.period_s))
-    for run in validation:
+    # What lies between long gaps is a run of its own, also where it has no measured Y.
+    for run in (one for one in validation if np.isfinite(one.y_um).any()):
         predicted = predict(model, run)
         predicted += float(np.mean((run.y_um - predicted)[_zero_of(run)]))
         parts.append(_part(run, predicted, np.isfinite(run.y_um), "held out", model.period_s))
@@ -487,9 +488,9 @@ def _without_isolated(
 def _zero_of(run: Run) -> Mask:
     """Return the samples whose mean is the zero of a run that was not fitted."""
     known = np.isfinite(run.y_um)
-    if not run.has_sparse_y:
-        return np.asarray(known & (run.t_s < run.t_s[0] + ZERO_S))
     first = np.flatnonzero(known)
+    if not run.has_sparse_y:
+        return np.asarray(known & (run.t_s < run.t_s[first[0]] + ZERO_S))
     until = max(run.t_s[first[0]] + ZERO_S, run.t_s[first[:ZERO_VALUES][-1]])
     return np.asarray(known & (run.t_s <= until))
 

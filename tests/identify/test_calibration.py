@@ -87,6 +87,16 @@ def test_the_four_methods(paper):
     assert result.deformation.main.gain(1)[1] > 0.5
 
 
+def test_validation_data_may_begin_without_y_and_have_a_part_without_it(paper):
+    (whole,) = simulated(PublishedQuill, Duty.paper_validation(2), 12)
+    late = dataclasses.replace(whole, y_um=np.where(np.arange(whole.t_s.size) < 90, np.nan, whole.y_um))
+    without = dataclasses.replace(whole, y_um=np.full(whole.t_s.size, np.nan))
+    result = calibrate(paper, Settings(order=(3, 3, 2)), period_s=60.0, name="x", validation=[late, without, whole])
+    late_part, whole_part = (part for part in result.parts if part.role == "held out")
+    assert late_part.t_s[0] == whole.t_s[90] and late_part.model.fit_pct > 90.0
+    assert whole_part.t_s[0] == whole.t_s[0] and whole_part.model.fit_pct > 90.0
+
+
 def test_methods_that_need_a_test_without_heat_say_so(paper):
     with pytest.raises(DataError, match="--etve"):
         calibrate(paper, Settings(method="II"), period_s=60.0, name="x")
