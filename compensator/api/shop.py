@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -62,7 +62,7 @@ class MachineLoop:
     found, proposed : tuple of str
         Effects of the last candidate of a diagnosis, and of a proposal that stands.
     diagnoses, adopted, gone_back : int
-        Numbers.
+        Numbers; of models those that took over, also where a person has ordered it.
     needs : str
         What a person has to do; empty where nothing.
     steps : tuple of (str, str)
@@ -119,17 +119,21 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
         contents = container.survey(whole=False)
         config, model = setup_of(contents, paths[-1].name)
         file = contents.attachments["model.toml"].data
-    summary = _Summary(str(folder), config.machine.name)
-    if config.loop is not None and config.loop.is_on:
+    is_recorded = config.loop is not None and config.loop.is_on
+    summary = _Summary(str(folder), config.machine.name, is_recorded=is_recorded)
+    if is_recorded:
         for step in _steps(paths, summary.cut):
             summary.add_events((event.kind, event.text, event.data, event.time_utc_ns) for event in step.events)
             if step.estimate is not None and step.offset is not None:
                 summary.add(step.estimate, step.offset, [probe for _, probe in step.probes])
-        return summary.result(is_recorded=True)
+        return summary.result()
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
     config = msgspec.structs.replace(config, loop=Loop(policy=policy))
-    alone, followed = _Summary("", ""), _Followed(LoopRun(config, file, diagnosis_in_process(config)))
+    alone, followed = (
+        _Summary("", "", is_recorded=False),
+        _Followed(LoopRun(config, file, diagnosis_in_process(config))),
+    )
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
     for step in _steps(paths, summary.cut):
         outcome, first = of_loop.process(step), of_first.process(step)
@@ -139,7 +143,7 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
             summary.add(outcome.estimate, outcome.offset, outcome.probes)
         if first is not None:
             alone.add(first.estimate, first.offset, first.probes)
-    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um)
+    return dataclasses.replace(summary.result(), first_um=alone.now_um)
 
 
 def _steps(paths: Sequence[Path], cut: list[str]) -> Iterator[RecordedStep]:
@@ -155,14 +159,17 @@ def _steps(paths: Sequence[Path], cut: list[str]) -> Iterator[RecordedStep]:
 
 
 class _Summary:
-    """Counts decisions, and keeps the errors of the last day."""
+    """Counts decisions, and keeps the errors of the last day: with the recorded offset, or with a computed one."""
 
-    def __init__(self, folder: str, machine: str) -> None:
+    def __init__(self, folder: str, machine: str, *, is_recorded: bool) -> None:
         self._named = {"folder": folder, "machine": machine}
+        self._is_recorded = is_recorded
         self._times = [0, 0]
         self._left: deque[tuple[int, float]] = deque()
         self._probed: deque[tuple[int, float]] = deque()
-        self._counts = dict.fromkeys(LoopAction, 0)
+        self._offsets: deque[tuple[int, float]] = deque()
+        #: Exchanges by what they were: a model that was adopted, or gone back to.
+        self._exchanged = Counter[str]()
         self._diagnoses = 0
         self._found: tuple[str, ...] = ()
         self._effects: tuple[str, ...] = ()
@@ -178,14 +185,24 @@ class _Summary:
         """Add a sample."""
         now_ns = estimate.time_utc_ns
         self._times = [self._times[0] or now_ns, now_ns]
-        left_um = number(estimate.y_um) + number(offset.y_offset_um)
+        offset_um = number(offset.y_offset_um)
+        probed = [(one.time_utc_ns, self._left_at(one)) for one in probes if one.taken]
         for kept, values in (
-            (self._left, [(now_ns, left_um)]),
-            (self._probed, [(probe.time_utc_ns, number(probe.measured_um)) for probe in probes if probe.taken]),
+            (self._left, [(now_ns, number(estimate.y_um) + offset_um)]),
+            (self._probed, probed),
+            # After the probes: what this sample's offset has learned of them was not applied while they measured.
+            (self._offsets, [(now_ns, offset_um)]),
         ):
             kept.extend(one for one in values if math.isfinite(one[1]))
             while kept and kept[0][0] <= now_ns - NOW_H * HOUR_NS:
                 kept.popleft()
+
+    def _left_at(self, probe: Probe) -> float:
+        """Return the error that a probe shows with the offset of its time, µm."""
+        if self._is_recorded:
+            return number(probe.measured_um)
+        before = (um for at_ns, um in reversed(self._offsets) if at_ns <= probe.time_utc_ns)
+        return number(probe.deformation_um) + next(before, math.nan)
 
     def add_events(self, events: Iterable[tuple[str, str, Any, int]]) -> None:
         """Add events: kind, text, data, time."""
@@ -198,6 +215,11 @@ class _Summary:
                 self._needs = str(data.get("needs", "")) if data.get("verdict") not in _HEALTHY else ""
             elif kind == EventKind.LOOP:
                 self._add_decision(data)
+            elif data.get("ok") is True:
+                # Not every decision was carried out: a model can end before its exchange.
+                effects = data.get("effects")
+                self._exchanged[str(data.get("action", LoopAction.ADOPT))] += 1
+                self._effects = tuple(map(str, effects)) if isinstance(effects, list) else ()
 
     def _add_decision(self, data: Any) -> None:
         try:
@@ -205,7 +227,6 @@ class _Summary:
         except msgspec.ValidationError:
             return  # of another version
         step, effects = found.step, tuple(found.effects)
-        self._counts[step] += 1
         if step == LoopAction.SHADOW:
             self._found = effects
             if self._proposed and same_effects(effects, self._proposed):
@@ -214,8 +235,6 @@ class _Summary:
             self._proposed, self._proposed_sha256 = effects, found.model_sha256
         elif step in _NOT_PROPOSED and found.model_sha256 == self._proposed_sha256:
             self._proposed, self._proposed_sha256 = (), ""
-        if step in (LoopAction.ADOPT, LoopAction.BACK):
-            self._effects = effects
 
     @property
     def now_um(self) -> float | None:
@@ -223,7 +242,7 @@ class _Summary:
         kept = self._left or self._probed
         return float(np.sqrt(np.mean(np.square([value for _, value in kept])))) if kept else None
 
-    def result(self, *, is_recorded: bool) -> MachineLoop:
+    def result(self) -> MachineLoop:
         """Return what the loop made of the machine.
 
         Raises
@@ -243,15 +262,15 @@ class _Summary:
             machine=self._named["machine"],
             from_utc=_utc(self._times[0]),
             to_utc=_utc(self._times[1]),
-            is_recorded=is_recorded,
+            is_recorded=self._is_recorded,
             measured_by="sensor" if self._left else "probe" if self._probed else "",
             now_um=self.now_um,
             effects=self._effects,
             found=self._found,
             proposed=self._proposed,
             diagnoses=self._diagnoses,
-            adopted=self._counts[LoopAction.ADOPT],
-            gone_back=self._counts[LoopAction.BACK],
+            adopted=self._exchanged[LoopAction.ADOPT],
+            gone_back=self._exchanged[LoopAction.BACK],
             needs=needs,
             steps=tuple(self._steps),
             cut=tuple(self.cut),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from compensator.api import shop
 from compensator.cli import main
+from compensator.clock import NS
 from compensator.demo.machine import configuration
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
 from compensator.service.loop.core import ModelLoop
@@ -78,6 +80,32 @@ def test_decisions_of_a_machine_with_a_loop_are_those_of_its_recordings(
     assert (one["adopted"], one["gone_back"]) == (0, 0)
     assert "decide on the proposal" in one["needs"]
     assert one["measured_by"] == "sensor" and one["now_um"] > 0.0 and one["first_um"] is None
+
+
+@pytest.mark.parametrize("takes_over", [False, True])
+def test_a_decision_that_was_not_carried_out_is_no_adoption(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], takes_over: bool
+) -> None:
+    decided = LoopData(step=LoopAction.ADOPT, effects=["gain:DTF"], model_sha256="a" * 64)
+    ended = LoopData(step=LoopAction.END, role="candidate", model_sha256="a" * 64, why="was_wrong")
+    exchange = {"ok": True, "action": "adopt", "by": "loop", "new_sha256": "a" * 64, "effects": ["gain:DTF"]}
+    refused = {"ok": False, "action": "adopt"}
+    after = (351, "adopt", "replaces", exchange) if takes_over else (351, "loop", "ended", ended.table())
+    told = (*TOLD, (350, "loop", "adopted", decided.table()), after, (360, "adopt", "refused", refused))
+    (one,) = result([str(recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=told))], capsys)
+    assert (one["adopted"], one["effects"]) == ((1, ["gain:DTF"]) if takes_over else (0, []))
+
+
+@pytest.mark.parametrize(("is_recorded", "now_um"), [(True, 30.0), (False, 5.0)])
+def test_the_error_that_probes_show_is_with_the_offset_of_the_loop(is_recorded: bool, now_um: float) -> None:
+    """The probe saw 50 µm with −20 µm applied; the loop that is computed now had −45 µm then, and learns of it."""
+    summary = shop._Summary("folder", "machine", is_recorded=is_recorded)
+    probe: Any = SimpleNamespace(time_utc_ns=10**18 + 1, measured_um=30.0, deformation_um=50.0, taken=True)
+    for i, offset_um in enumerate((-60.0, -20.0 if is_recorded else -45.0, -50.0)):
+        estimate: Any = SimpleNamespace(time_utc_ns=10**18 + (i - 1) * 60 * NS, y_um=None)
+        offset: Any = SimpleNamespace(y_offset_um=offset_um)
+        summary.add(estimate, offset, [probe] if i == 2 else [])
+    assert summary.now_um == pytest.approx(now_um)
 
 
 @pytest.mark.parametrize(
