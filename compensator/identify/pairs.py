@@ -7,6 +7,7 @@ and slower, unlike any other probe.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -36,7 +37,8 @@ class Pair:
     ratio : float
         How far the second moves where the first moves by 1.
     apart_um : float
-        How far they move apart within a record, µm.
+        How far they move apart within a record, µm; of two that move against each other, if both counted in the same
+        sense.
     share : bool
         Whether the data permit common time constants.
     """
@@ -102,6 +104,7 @@ def pairs(
     for first, second in itertools.combinations(changes, 2):
         correlation, ratio = found.get(frozenset((first, second)), (0.0, 0.0))
         beside = [abs(r) for names, (r, _) in found.items() if len(names & {first, second}) == 1]
+        sign = math.copysign(1.0, correlation)
         if abs(correlation) >= PAIR and max(beside, default=0.0) <= OTHERS:
             yield Pair(
                 first=first,
@@ -109,7 +112,7 @@ def pairs(
                 correlation=correlation,
                 others=max(beside, default=0.0),
                 ratio=ratio,
-                apart_um=max(_span(a - b) for a, b in zip(probes[first], probes[second], strict=True)),
+                apart_um=max(_span(a - sign * b) for a, b in zip(probes[first], probes[second], strict=True)),
                 share=any(first in group and second in group for group in shared),
             )
 

@@ -201,7 +201,9 @@ def test_the_lines_of_a_tilt_are_a_configuration_once_they_are_filled_in(tmp_pat
 def test_probes_that_move_against_each_other_are_said_in_the_lines():
     slow = np.cumsum(np.random.default_rng(2).normal(0.0, 1.0, 1500))
     [pair] = pairs({"p1": [slow], "p2": [-0.7 * slow]}, 60.0)
-    assert pair.apart_um == pytest.approx(1.7 * np.ptp(slow))
+    [alike] = pairs({"p1": [slow], "p2": [0.7 * slow]}, 60.0)
+    # The sense in which one of them counts is no tilt.
+    assert pair.apart_um == alike.apart_um == pytest.approx(0.3 * np.ptp(slow))
     both = ("p1", "p2")
     assert "against each other" in tilt_lines([(*both, 1.0)], against=[both])
     assert "against each other" not in tilt_lines([(*both, 1.0)])
