@@ -27,12 +27,16 @@ from compensator.report.page import Block, Cell, Details, Figure, Line, Marks, S
 
 #: Number of steps that are kept; the others are only counted.
 STEPS = 400
-#: Longest time between a decision and the exchange of the model that follows from it, s.
-_FOLLOWS_S = 1800.0
 #: Models whose time in force is drawn one by one.
 _MODELS = 8
 _BY_LOOP, _BY_OPERATOR = "the loop", "an operator"
 _NS, _HALF_DAY_S = 1e-9, 43200.0
+#: Why the loop decides after a person's order.
+_ORDERS: Mapping[str, str] = {
+    CommandName.ADOPT: "by_hand",
+    CommandName.BACK: "by_hand",
+    CommandName.DISMISS: "dismissed",
+}
 #: Steps in words; those of every night are counted.
 WORDS: Mapping[str, str] = {
     LoopAction.SHADOW: "comparison begins",
@@ -99,8 +103,8 @@ class Story:
     counts: Counter[str] = field(default_factory=Counter)
     diagnoses: Counter[str] = field(default_factory=Counter)
     needs: str = ""
-    _decided: Step | None = None
-    _sender: str = ""
+    #: Who gave the last order, by why the loop then decides.
+    _senders: dict[str, str] = field(default_factory=dict)
     #: Hashes of what was proposed: the same one again is no other proposal.
     _proposed: set[str] = field(default_factory=set)
 
@@ -118,8 +122,8 @@ class Story:
             if found is not None and not found.without:
                 self.diagnoses[found.verdict] += 1
                 self.needs = found.needs
-        elif event.kind == EventKind.COMMAND and command_of(event) in (CommandName.ADOPT, CommandName.BACK):
-            self._sender = str(event.data.get("by", ""))
+        elif event.kind == EventKind.COMMAND and (why := _ORDERS.get(command_of(event))):
+            self._senders[why] = str(event.data.get("by", ""))
         elif event.kind == EventKind.ADOPT:
             self._add_exchange(event)
 
@@ -133,17 +137,16 @@ class Story:
             text=event.text,
             model_sha256=found.model_sha256,
             effects=tuple(found.effects),
+            by=(self._senders.get(found.why) or _BY_OPERATOR) if found.why in _ORDERS.values() else _BY_LOOP,
             comparison=found.comparison,
         )
-        self._decided = step if found.step in (LoopAction.ADOPT, LoopAction.BACK) else self._decided
         self._append(step)
 
     def _add_exchange(self, event: Event) -> None:
         """Add a change of the model that an operator has ordered; that of the loop follows from its decision."""
-        at_s, data, decided = event.time_utc_ns * _NS, event.data, self._decided
-        effects = data.get("effects")
-        self._decided = None
-        if decided is not None and at_s - decided.at_s <= _FOLLOWS_S and data.get("ok") is True:
+        at_s, data = event.time_utc_ns * _NS, event.data
+        effects, sender = data.get("effects"), self._senders.pop("by_hand", "")
+        if data.get("by") == "loop":
             return
         comparison = data_of(event, _Compared)
         self._append(
@@ -153,11 +156,10 @@ class Story:
                 text=event.text,
                 model_sha256=str(data.get("new_sha256", "")),
                 effects=tuple(map(str, effects)) if isinstance(effects, list) else None,
-                by=self._sender or _BY_OPERATOR,
+                by=sender or _BY_OPERATOR,
                 comparison=comparison.comparison if comparison is not None else None,
             )
         )
-        self._sender = ""
 
     def _append(self, step: Step) -> None:
         is_again = step.what == LoopAction.PROPOSE and step.model_sha256 in self._proposed

@@ -156,3 +156,29 @@ def test_a_candidate_that_is_proposed_again_is_one_proposal() -> None:
         story.add(Event(schema=1, machine="m", seq=number, time_utc_ns=number, kind="loop", text=step, data=data))
     counted = figures_of(story)["models_story"]
     assert isinstance(counted, dict) and counted["proposed"] == 2 and "2 proposed" in in_words(story)
+
+
+def told(story: Story, minute: int, kind: str, data: dict[str, Any]) -> None:
+    time_utc_ns = minute * 60 * 10**9
+    story.add(Event(schema=1, machine="m", seq=minute, time_utc_ns=time_utc_ns, kind=kind, text=kind, data=data))
+
+
+def test_who_accepts_or_dismisses_a_candidate_of_the_loop_is_named() -> None:
+    story = Story()
+    told(story, 1, "command", {"command": "adopt", "candidate": True, "by": "anna"})
+    told(story, 1, "loop", LoopData(step=LoopAction.ADOPT, why="by_hand", model_sha256=CANDIDATE).table())
+    told(story, 2, "adopt", {"ok": True, "action": "adopt", "by": "loop", "new_sha256": CANDIDATE})
+    told(story, 8, "command", {"command": "dismiss", "by": "bert"})
+    told(story, 8, "loop", LoopData(step=LoopAction.END, why="dismissed", model_sha256=BEFORE).table())
+    told(story, 9, "loop", LoopData(step=LoopAction.END, why="worse", model_sha256=BEFORE).table())
+    told(story, 10, "loop", LoopData(step=LoopAction.END, why="by_hand", model_sha256=BEFORE).table())  # at a restart
+    assert [step.by for step in story.steps] == ["anna", "bert", "the loop", "an operator"]
+
+
+def test_a_person_s_model_soon_after_a_decision_that_was_not_carried_out_is_told() -> None:
+    story = Story()
+    told(story, 1, "loop", LoopData(step=LoopAction.ADOPT, model_sha256=CANDIDATE).table())
+    told(story, 2, "loop", LoopData(step=LoopAction.END, why="was_wrong", model_sha256=CANDIDATE).table())
+    told(story, 10, "command", {"command": "adopt", "by": "bert"})
+    told(story, 12, "adopt", {"ok": True, "action": "adopt", "new_sha256": "d" * 64})
+    assert (story.steps[-1].what, story.steps[-1].by, story.steps[-1].model_sha256) == ("adopt", "bert", "d" * 64)
