@@ -146,7 +146,7 @@ class _Reader:
             table = parse_toml(part.data) if part else {}
             self._model = str(table.get("name", ""))
             own = table.get("axis", {}).get(FIRST, table)  # of several axes: those of Y
-            self._effects = [label_of(effect) for effect in own.get("effect", [])]
+            self._effects = _numbered([label_of(effect) for effect in own.get("effect", [])])
 
     def _sample(self, sample: Sample) -> None:
         t = sample.time_utc_ns * _NS
@@ -175,7 +175,8 @@ class _Reader:
             shares["at the zero"] = -estimate.y_base_um
         if self.history.probes_count:
             # Zero before the first probe taken; the prediction is the sum of all shares.
-            shares["probes"] = number(estimate.y_pred_um) - math.fsum(shares.values())
+            modelled = (number(estimate.y_dtf_um), number(estimate.y_tdtf_um), *estimate.y_effects_um)
+            shares["probes"] = number(estimate.y_pred_um) - math.fsum((*modelled, -estimate.y_base_um))
         for name, value in shares.items():
             self._append(f"share {name}", t, value)
         y, residual = number(estimate.y_um), number(estimate.residual_um)
@@ -287,7 +288,7 @@ class _Reader:
             history.reason_seconds[reason] += last - first
         episode = self._episode
         if episode is not None and (episode.state, episode.reasons) == (state, reasons):
-            self._episode = replace(episode, seconds=last - episode.first_s, last_s=last)
+            self._episode = replace(episode, seconds=episode.seconds + last - first, last_s=last)
             return
         self._close()
         if state != State.OK:
@@ -328,3 +329,9 @@ class _Reader:
             date = datetime.fromtimestamp(number_of_day * _DAY_S, UTC).date().isoformat()
             day = self._days[number_of_day] = self.history.days.setdefault(date, Period())
         return day
+
+
+def _numbered(labels: Sequence[str]) -> list[str]:
+    """Return labels with a number behind each that is there already: a model may have two effects of one kind."""
+    numbers = [labels[: i + 1].count(label) for i, label in enumerate(labels)]
+    return [label if number == 1 else f"{label} {number}" for label, number in zip(labels, numbers, strict=True)]

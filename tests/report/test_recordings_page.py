@@ -7,6 +7,8 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from compensator.cli import main
 from compensator.codes import explain
 from compensator.recording.reading import recordings
 from compensator.report.envelope import COLUMNS, Envelope, Stretches
-from compensator.report.gathering import read_history
+from compensator.report.gathering import _Reader, read_history
 from compensator.report.history import NO_RECORDING, History, Period
 from compensator.report.page import Page, codes_of, html_of, write_page
 from compensator.report.recordings import page_of, verdict
@@ -149,6 +151,33 @@ def test_what_is_left_is_held_against_what_the_service_states(left: float, state
     assert ("left_beyond_stated" in codes_of(page.blocks)) == beyond
     assert ("23 times the standard deviation of 0.28 µm" in page.verdict) == beyond
     assert ("states a standard deviation of 0.28 µm" in page.verdict) == (not beyond and stated > 0.0)
+
+
+def test_two_effects_of_one_kind_have_a_share_each_and_the_probes_what_is_theirs() -> None:
+    reader = _Reader()
+    table = "".join(f'[[effect]]\nkind = "input"\nchannel = "oil_degc"\ncurve = "{curve}"\n' for curve in "ab")
+    contents: Any = SimpleNamespace(metadata={}, attachments={"model.toml": SimpleNamespace(data=table.encode())})
+    reader._opening(contents)
+    reader.history.probes_count = 1
+    values = {"y_dtf_um": 10.0, "y_tdtf_um": 1.0, "y_effects_um": [4.0, 3.0], "y_base_um": 2.0, "y_pred_um": 16.5}
+    missing = dict.fromkeys(("y_um", "residual_um", "heat_w"))
+    estimate: Any = SimpleNamespace(time_utc_ns=START_NS, seq=1, **values, **missing)
+    reader._estimate(estimate)
+    shares = {name: value for name, (_, (value,)) in reader._buffers.items() if name.startswith("share ")}
+    assert shares["share input oil_degc"] == 4.0 and shares["share input oil_degc 2"] == 3.0
+    assert shares["share probes"] == pytest.approx(0.5) and sum(shares.values()) == pytest.approx(16.5)
+
+
+def test_an_episode_over_a_clock_that_was_set_back_has_its_length() -> None:
+    reader = _Reader()
+    offset = {"y_offset_um": 1.0, "y_offset_std_um": 1.0, "model_sha256": "a", "state": "hold", "reasons": ["hold"]}
+    for i in range(180):
+        back_s = 3 * 3600 if i >= 120 else 0
+        one: Any = SimpleNamespace(seq=i, time_utc_ns=START_NS + (60 * i - back_s) * 10**9, **offset)
+        reader._offset(one)
+    reader._close()
+    (episode,) = reader.history.episodes
+    assert episode.seconds == pytest.approx(reader.history.whole.seconds["hold"]) == pytest.approx(180 * 60.0, abs=61.0)
 
 
 def test_a_minute_is_not_rounded_away() -> None:
