@@ -135,9 +135,9 @@ def _joined(parts: list[dict[str, Vector]], name: str) -> Vector:
 
 def _scores(parts: list[dict[str, Vector]]) -> tuple[Scores, Scores] | None:
     """Return the errors of the model and of no compensation on the same samples; None without measured Y."""
-    if not any("y_um" in part for part in parts):
-        return None
     y, predicted = _joined(parts, "y_um"), _joined(parts, "y_pred_um")
+    if not np.isfinite(y - predicted).any():
+        return None
     return scores(y, predicted), scores(y, np.where(np.isfinite(predicted), 0.0, np.nan))
 
 

@@ -357,6 +357,8 @@ def _seconds(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequenc
 def _timestamp(cell: Any) -> float:
     if cell is None or (isinstance(cell, str) and not cell.strip()):
         return math.nan
+    if not isinstance(cell, str | datetime):
+        raise TypeError(f"{type(cell).__name__} is no date and time")
     time = cell if isinstance(cell, datetime) else datetime.fromisoformat(cell.strip())
     return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 

@@ -167,6 +167,7 @@ def test_a_list_is_several_runs_and_recordings_of_it_are_one(run: Path) -> None:
         (SMALL | {"y_um": [1.0, np.inf, 2.0]}, "data: row 1: y_um = inf, expected a finite number"),
         (SMALL | {"t_s": [0.0, np.nan, 120.0]}, "data: row 1: time is missing"),
         ({"time_utc": ["soon"], "y_um": [1.0]}, "data: row 0: time_utc = 'soon', expected a time such as 2025"),
+        ({"time_utc": [1.76e9], "y_um": [1.0]}, "data: row 0: time_utc = '1760000000.0', expected a time such as 2025"),
         (pd.DataFrame([[0.0, 1.0, 1.0]], columns=["t_s", "y_um", "y_um"]), "data: column 'y_um' is there twice"),
         ("absent.csv", "absent.csv: No such file"),
     ],

@@ -123,6 +123,9 @@ def test_a_free_run_shows_and_draws_itself(run: Path) -> None:
     without = {name: values for name, values in arrays(run).items() if name != "y_um"}
     alone = tc.simulate("quill", without)
     assert alone.scores is None and "residual_um" not in alone and "rms_um" not in alone.to_dict()
+    # A logger writes the column of a sensor that is not connected, too.
+    empty = tc.simulate("quill", without | {"y_um": np.full(arrays(run)["y_um"].size, np.nan)})
+    assert empty.scores is None and empty.nothing is None and "rms_um" not in empty.to_dict()
     np.testing.assert_array_equal(alone["y_pred_um"], out["y_pred_um"])
     assert len(shown(alone)) > 5_000
     # Two runs are one after another; a column that only one of them has is missing in the other.
