@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from typing import Any
 
 from compensator.axes import FIRST
@@ -17,15 +18,17 @@ from compensator.service.transfer.model_store import check_model
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     setup = load(arguments.config)
-    config, model = setup.config, setup.model
     if arguments.model is not None:
-        model = model_of(config, read_model_bytes(arguments.model), source=arguments.model)
+        data = read_model_bytes(arguments.model)
+        model = model_of(setup.config, data, source=arguments.model)
+        setup = dataclasses.replace(setup, model=model, model_bytes=data)
+    config, model = setup.config, setup.model
     configured = {channel.name for channel in config.channel}
     if missing := [name for name in model.channels if name not in configured]:
         return _without_channels(arguments.config, model.name, missing)
     checks = Compensation(config, model).describe_checks()
     if arguments.model is not None:
-        check_model(config, read_model_bytes(arguments.model), source=arguments.model)
+        check_model(config, setup.model_bytes, source=arguments.model)
     warnings = setup.warnings()
     log_warnings(arguments.config, warnings)
     machine, devices = config.machine.name, setup.fleet.devices

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tomllib
 from pathlib import Path
@@ -13,6 +14,8 @@ from compensator.channel_lines import channel_lines
 from compensator.cli import main
 from compensator.config import load_config
 from compensator.demo.calibration import write_table
+from compensator.model.model_file import load_model
+from compensator.model.model_writer import write_axes
 from tests.diagnose.scenarios import draw, record
 from tests.reference.kept import KEPT
 
@@ -38,6 +41,16 @@ def test_check_prints_the_lines_that_are_missing(tmp_path: Path, capfd: pytest.C
     config.write_text(EXAMPLE.read_text(encoding="utf-8") + lines, encoding="utf-8")
     assert {channel.name for channel in load_config(config).config.channel} >= set(missing)
     assert main(["check", "--config", str(config), "--model", str(MODEL)]) == 0
+
+
+def test_check_names_the_parts_of_the_model_that_it_is_given(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    quill = dataclasses.replace(load_model("quill"), file=b"")
+    write_axes(tmp_path / "several.toml", {"y": quill, "z": dataclasses.replace(quill, axis="z")})
+    words = ["check", "--config", str(EXAMPLE), "--json"]
+    assert main(words) == 0 and "axes" not in json.loads(capfd.readouterr().out)
+    assert main([*words, "--model", str(tmp_path / "several.toml")]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert (found["axes"], found["unused_parts"]) == (["y"], ["z"])
 
 
 def test_a_configured_model_without_its_channel_is_named_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
