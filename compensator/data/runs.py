@@ -185,7 +185,7 @@ def noise_std(values: Vector) -> float:
     typical = float(np.median(size)) / 0.6745
     lower = size[: max(1, int(0.9 * size.size))]
     # The mean square over the lower nine tenths of a normal's magnitudes is 0.6107 of its variance.
-    return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
+    return typical or float(np.sqrt(np.mean(lower**2) / 0.6107))
 
 
 def is_sparse(values: Vector) -> bool:
