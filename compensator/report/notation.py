@@ -27,5 +27,16 @@ def plain(value: float | None, digits: int = 2) -> str:
     return _formatted(value, f"z.{digits}f")
 
 
+def or_null(value: float) -> float | None:
+    """Return a number for JSON, to 0.1 nm where it is in µm; None for a missing value.
+
+    Examples
+    --------
+    >>> or_null(1.23456), or_null(math.nan)
+    (1.2346, None)
+    """
+    return None if math.isnan(value) else round(value, 4)
+
+
 def _formatted(value: float | None, form: str) -> str:
     return "–" if value is None or math.isnan(value) else format(value, form).replace("-", "−")

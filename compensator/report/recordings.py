@@ -26,7 +26,7 @@ from compensator.report.history import (
     Spread,
 )
 from compensator.report.local_time import here, shown, zone, zone_at
-from compensator.report.notation import plain, signed
+from compensator.report.notation import or_null, plain, signed
 from compensator.report.page import (
     Block,
     Cell,
@@ -123,10 +123,10 @@ def figures(history: History) -> dict[str, object]:
         "samples": whole.samples,
         "files": len(history.files),
         "minutes": {state: round(seconds / 60.0, 1) for state, seconds in whole.seconds.items()},
-        "largest_offset_um": _null(whole.offset.peak),
-        "residual_rms_um": _null(whole.residual.rms),
-        "measured_rms_um": _null(whole.measured.rms),
-        "left_rms_um": _null(whole.left.rms),
+        "largest_offset_um": or_null(whole.offset.peak),
+        "residual_rms_um": or_null(whole.residual.rms),
+        "measured_rms_um": or_null(whole.measured.rms),
+        "left_rms_um": or_null(whole.left.rms),
         "models": list(history.models),
         **_probe_figures(history),
         **figures_of(history.story),
@@ -369,7 +369,7 @@ def _marks(name: str, probes: Sequence[ProbeShown], marker: Literal["x", "o"]) -
 def _probe_figures(history: History) -> dict[str, object]:
     if not history.probes_count:
         return {}
-    left_um = _null(history.probes_left.rms)
+    left_um = or_null(history.probes_left.rms)
     return {"probes": history.probes_count, "probes_taken": history.probes_taken, "probes_left_rms_um": left_um}
 
 
@@ -620,7 +620,3 @@ def _share(history: History, state: str) -> str:
     # Never rounded to 0 or 100 %.
     shown = share if share in (0.0, 1.0) else min(max(share, 0.0005), 0.9995)
     return f"{100.0 * shown:.1f} %"
-
-
-def _null(value: float) -> float | None:
-    return None if math.isnan(value) else value

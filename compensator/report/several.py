@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ from compensator.messages_axes import SHOWN_UNITS, UNITS
 from compensator.report.figure import Figure, Strip
 from compensator.report.history import FOLLOWED, History, Period
 from compensator.report.local_time import shown
-from compensator.report.notation import plain, signed
+from compensator.report.notation import or_null, plain, signed
 from compensator.report.page import Block, Cell, CodeLink, Table
 
 
@@ -124,10 +123,10 @@ def figures_of_axes(history: History) -> dict[str, Any]:
     found = {
         name: {
             "unit": unit_of(name),
-            "largest_offset": _null(figures.offset.peak),
-            "measured_rms": _null(figures.measured.rms),
-            "left_rms": _null(figures.left.rms),
-            "residual_rms": _null(figures.residual.rms),
+            "largest_offset": or_null(figures.offset.peak),
+            "measured_rms": or_null(figures.measured.rms),
+            "left_rms": or_null(figures.left.rms),
+            "residual_rms": or_null(figures.residual.rms),
             **_minutes_apart(history, name),
         }
         for name, figures in history.axes.items()
@@ -156,7 +155,3 @@ def _row(name: str, figures: Period) -> list[Any]:
 def _reasons(history: History, name: str) -> str:
     """Return the reasons of an axis with the number of their samples, the most frequent first."""
     return ", ".join(f"{reason} {count}" for reason, count in history.axis_reasons[name].most_common()) or "none"
-
-
-def _null(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 4)
