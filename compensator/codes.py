@@ -352,7 +352,7 @@ class SampleQuality(Code):
     TOO_FEW = "too_few", "The sample has too few good readings.", "See the channel's errors: line, module, noise."
     OUTLIER = (
         "outlier",
-        "A single reading far from the others of its sample was left out.",
+        "Single readings far from the others of their sample were left out.",
         "Nothing if this is rare; if it is frequent, check the line for noise.",
     )
     OUT_OF_RANGE = "out_of_range", "The value is outside the channel's plausible range.", "Check sensor and range."

@@ -3,6 +3,11 @@
 Samples end at whole multiples of the period in UTC. Each wait ends at the next point of this grid, so errors do not
 accumulate. Setting the wall clock changes the labels, not the pace: the step is reported, and the grid starts again. So
 it does where the service stood still for a sample or longer, and the samples that are missing are counted.
+
+A reading far from the median of its sample, in robust standard deviations, is left out. Where more than half of the
+readings are equal, the smallest difference from them takes the place of the standard deviation: the step of the
+converter. A temperature or a displacement beyond any converter's step (`STEP_MAX`) is an outlier, however many there
+are; the value of another channel, such as a speed or a power, may be switched within a sample.
 """
 
 from __future__ import annotations
@@ -26,6 +31,8 @@ from drivers.reading import Device, Quality, Reading
 WAIT_PART = 0.5
 #: A reading farther from the median than this number of robust standard deviations is left out.
 OUTLIER_SIGMA = 6.0
+#: Largest step of a converter by the unit of its channel: whole degrees, and more than whole micrometres.
+STEP_MAX = {"degc": 1.0, "um": 5.0}
 #: Median absolute deviation of a normal distribution, as a fraction of its standard deviation.
 _MAD_OF_SIGMA = 0.6745
 _OUTLIER = str(SampleQuality.OUTLIER)
@@ -101,10 +108,13 @@ class ChannelCollector:
     ----------
     min_good_fraction : float
         Fraction of the polls that must give a good reading for the mean to be valid.
+    step_max : float, optional
+        Largest difference between equal readings and the others that a converter makes, in the unit of the channel.
     """
 
-    def __init__(self, min_good_fraction: float) -> None:
+    def __init__(self, min_good_fraction: float, step_max: float = math.inf) -> None:
         self._min_good_fraction = min_good_fraction
+        self._step_max = step_max
         self._readings: list[Reading] = []
         self._errors: Counter[str] = Counter()
         self._polls = 0
@@ -126,7 +136,7 @@ class ChannelCollector:
         """Return the sample of the collected readings and start the next one."""
         readings, errors, polls = self._readings, self._errors, self._polls
         self._readings, self._errors, self._polls = [], Counter(), 0
-        kept, outliers = _without_outliers(readings)
+        kept, outliers = _without_outliers(readings, self._step_max)
         if outliers:
             errors[_OUTLIER] += outliers
         enough = len(kept) >= max(1, math.ceil(self._min_good_fraction * polls))
@@ -147,7 +157,7 @@ class ChannelCollector:
         )
 
 
-def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
+def _without_outliers(readings: list[Reading], step_max: float) -> tuple[list[Reading], int]:
     """Leave out single outliers; a slope over the sample is not an outlier."""
     if len(readings) < 5:
         return readings, 0
@@ -158,7 +168,10 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
     if sigma == 0.0:
         # Quantised and quiet: more than half of the values are equal; the step is the smallest difference.
         steps = [d for d in distance if d > 0.0]
-        sigma = min(steps) if len(steps) > 1 else math.inf if _near(values) else 0.0
+        if len(steps) > 1:
+            sigma = min(steps) if min(steps) <= step_max else 0.0
+        else:
+            sigma = math.inf if _near(values) else 0.0
     kept = [reading for reading, d in zip(readings, distance, strict=True) if d <= OUTLIER_SIGMA * sigma]
     return kept, len(readings) - len(kept)
 
@@ -217,7 +230,10 @@ class Sampler:
         self._clock = clock
         self._note = note
         fraction = config.sampling.min_good_fraction
-        self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
+        self._collectors = {
+            channel.name: ChannelCollector(fraction, STEP_MAX.get(channel.name.rpartition("_")[2], math.inf))
+            for channel in config.channel
+        }
         for channel in config.channel:
             self._devices[channel.device].channels.append((channel.input, self._collectors[channel.name]))
 

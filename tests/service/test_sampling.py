@@ -41,6 +41,64 @@ def test_a_reading_that_no_recording_holds_is_invalid(value: float) -> None:
     assert math.isnan(sample.mean or 0.0) and sample.max == 20.0
 
 
+EXTRA: dict[str, Any] = {"device": "module", "input": 7}
+
+
+async def mean_of(channel: str, values: list[float]) -> tuple[float, int]:
+    """Return mean and number of outliers of a sample that a channel's device measures so."""
+    conf = config(channel=[*TABLE["channel"][:2], {**EXTRA, "name": channel}])
+    left = iter(values)
+
+    class Device:
+        name = "module"
+        units: Mapping[int, str] = {}
+
+        async def read(self) -> Mapping[int, Reading]:
+            value = next(left)
+            return {number: Reading.good(value) for number in (0, 1, EXTRA["input"])}
+
+        async def close(self) -> None:
+            """Nothing to release."""
+
+    sampler = Sampler(conf, {"module": Device()}, VirtualClock(START_NS), lambda *_: None)
+    for _ in values:
+        await sampler.poll(1.0)
+    sample = sampler.close_sample()[channel]
+    return number(sample.mean), sample.errors.get("outlier", 0)
+
+
+@pytest.mark.parametrize("value", [23.4, 0.0, -3.0])
+@pytest.mark.parametrize("wrong", [(61.6,), (61.6, 38.6), (38.6, 38.6), (21.6, 7.0, -70.0)])
+@pytest.mark.parametrize("channel", ["nut_degc", "base_um"])
+async def test_wrong_readings_of_a_quiet_channel_are_left_out_however_many(
+    channel: str, wrong: tuple[float, ...], value: float
+) -> None:
+    """Else the nearest wrong one counts as the step of the converter, and the others are near it in such steps."""
+    assert await mean_of(channel, [value] * 10 + [value + one for one in wrong]) == (value, len(wrong))
+
+
+@pytest.mark.parametrize(
+    ("channel", "quiet", "others"),
+    [
+        ("nut_degc", 23.4, (23.5, 23.5, 23.3, 23.6)),  # 0.1 K
+        ("nut_degc", 0.4, (0.5, 0.5, 0.6)),  # near zero
+        ("nut_degc", 23.0, (24.0, 24.0, 24.0)),  # whole degrees
+        ("base_um", 0.0, (1.0, 1.0, -1.0)),
+        ("base_um", 0.0, (4.9, 4.9)),  # 12 bit of ±10 mm
+        ("spindle_rpm", 0.0, (3000.0, 9000.0, 12000.0)),  # it starts
+        ("spindle_rpm", 12000.0, (0.0, 0.0, 8000.0, 8000.0)),  # a change of the tool
+        ("pump_percent", 0.0, (100.0, 100.0)),
+        ("flow_lpm", 8.0, (0.0, 0.0, 0.0)),
+    ],
+)
+async def test_steps_of_a_converter_and_what_is_switched_count(
+    channel: str, quiet: float, others: tuple[float, ...]
+) -> None:
+    values = [quiet] * 8 + list(others)
+    mean, outliers = await mean_of(channel, values)
+    assert outliers == 0 and mean == pytest.approx(math.fsum(values) / len(values), abs=1e-12)
+
+
 class SlowDevice:
     """A device that answers each request when the test says so."""
 
