@@ -14,16 +14,23 @@ import numpy as np
 import pytest
 
 from compensator.audit.series import audit
+from compensator.clock import HOUR_NS
+from compensator.codes import ProbeCode
 from compensator.config import parse_config
 from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.messages import Probe
 from compensator.model.model_file import parse_model
 from compensator.recording.reading import messages, recordings
-from compensator.service.transfer.comparison import changed
+from compensator.service.compensation import Compensation
+from compensator.service.probing.received import unused_probe
+from compensator.service.transfer.comparison import Comparison, ComparisonState, changed
 from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.second_opinion import described, second_opinion
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.probed import PROBED, ProbedMachine
+from tests.service.records import sample
+from tests.service.simulated import START_NS
 from tests.service.test_adoption import Asked, adopted, payload
 from tests.service.test_restart import QUILL, STRONGER
 
@@ -188,7 +195,10 @@ async def test_a_sensor_that_was_moved_refuses_no_better_model(tmp_path: Path, m
         assert machine.opinion(other, QUILL).verdict == "better"
         odd.append(machine.opinion(QUILL, other))
         assert odd[-1].verdict == "worse"
-    assert any(found.y_moved and "about the zero it looks otherwise" in described(found) for found in odd)
+    moved = [found for found in odd if found.y_moved]
+    assert moved and all("about the zero it looks otherwise" in described(found) for found in moved)
+    assert all(f"(its error changes {found.ratio:.2g} times as much; it is" in described(found) for found in moved)
+    assert all(found.ratio is not None and 1.05 < found.ratio < 100.0 for found in odd)
 
 
 def test_where_y_has_moved_the_figures_of_the_verdict_come_first() -> None:
@@ -284,8 +294,8 @@ async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
 async def test_a_chip_on_the_probe_refuses_no_model(tmp_path: Path) -> None:
     machine = ProbedMachine(tmp_path, gain=1.0, config=PROBED)
     machine.each_hour(1300, every=80)
-    for sample in (400, 960):
-        machine.at_sample[sample] = functools.partial(machine.probe, wrong_um=35.0)
+    for at in (400, 960):
+        machine.at_sample[at] = functools.partial(machine.probe, wrong_um=35.0)
     await machine.run(1300)
     models = [parse_model(data, source="test") for data in (QUILL, gain(0.05))]
     found = second_opinion(machine.recordings, machine.config, *models)
@@ -301,6 +311,31 @@ async def test_few_probes_do_not_judge(tmp_path: Path) -> None:
     found = second_opinion(machine.recordings, machine.config, *models)
     assert (found.verdict, found.why, found.probes) == ("not_judged", "too_little", 4)  # the first one is the zero
     assert "at least 8 probes" in described(found)
+
+
+@pytest.mark.parametrize("without", ["present", "other", "both"])
+def test_a_probe_that_a_model_cannot_compare_ends_no_verdict(without: str) -> None:
+    """A model that was not there at its time says nothing of it; the probe is of no use for a comparison."""
+    outcome = Compensation(settings(), parse_model(QUILL, source="test")).process(sample(0, {}))
+    comparison, rng = Comparison(60.0), np.random.default_rng(1)
+
+    def probe(innovation_um: float | None) -> Probe:
+        unused = unused_probe(MACHINE, START_NS, ProbeCode.MISMATCH, "")
+        std_um = None if innovation_um is None else 0.5
+        return msgspec.structs.replace(unused, taken=True, innovation_um=innovation_um, innovation_std_um=std_um)
+
+    for number in range(30):
+        noise_um, more_um = rng.normal(size=2).tolist()
+        pair = [probe(5.0 * more_um + noise_um), probe(noise_um)]
+        if number == 5:
+            pair = [probe(None) if without in (name, "both") else probe(1.0) for name in ("present", "other")]
+        at = msgspec.structs.replace(outcome.sample, time_utc_ns=START_NS + number * HOUR_NS)
+        both = [msgspec.structs.replace(outcome, sample=at, probes=(one,)) for one in pair]
+        comparison.add(*both, suspected=False)
+    found = comparison.verdict()
+    assert (found.verdict, found.probes) == ("better", 29)
+    kept = msgspec.json.encode(comparison.state)
+    assert msgspec.json.decode(kept, type=ComparisonState) == comparison.state
 
 
 def test_a_record_that_cannot_be_replayed_is_said(tmp_path: Path) -> None:

@@ -166,7 +166,7 @@ class Comparison:
             for own, other in zip(present.probes, candidate.probes, strict=True)
             if self._axis == FIRST
             and (own.taken or other.taken)
-            and max(number(own.innovation_std_um), number(other.innovation_std_um)) < UNKNOWN_UM
+            and all(number(one.innovation_std_um) < UNKNOWN_UM for one in (own, other))
         ]
         state, is_measured, now_ns = self.state, math.isfinite(sum(residuals)), present.sample.time_utc_ns
         if suspected:

@@ -68,7 +68,7 @@ def second_opinion(
     for axis, comparison in found.items():
         first_ns = comparison.state.first_ns
         hours = (window.end_ns - first_ns) / HOUR_NS if first_ns else 0.0
-        verdicts[axis] = changed(comparison.verdict(), hours=hours, ratio=None, offset_change_um=moves_um.get(axis))
+        verdicts[axis] = changed(comparison.verdict(), hours=hours, offset_change_um=moves_um.get(axis))
     own = verdicts.pop(FIRST)
     return changed(own, axes=verdicts)
 
