@@ -147,11 +147,10 @@ class FurtherOutputs:
         """Return the last published value of each output by name, in its unit."""
         return {name: state.offset for name, state in self.states.items()}
 
-    def continue_from(self, offsets: Mapping[str, float], *, model_changed: bool) -> None:
+    def take_offsets(self, offsets: Mapping[str, float]) -> None:
         """Continue from published values; an output without one starts at 0, as the control applies none."""
         for name, state in self.states.items():
             state.offset = offsets.get(name, 0.0)
-            state.model_changed = model_changed
 
     def begin(self, bases: Mapping[str, float]) -> None:
         """Start with a zero that was set before the record; the next measured value is the reference.

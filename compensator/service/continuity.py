@@ -6,7 +6,7 @@ The state is everything that determines the next outcome. What becomes of a samp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from compensator.clock import NS
 from compensator.config import Config
@@ -286,14 +286,23 @@ class Continuity:
 
     def continue_from(self, handover: Handover) -> None:
         """Continue from another compensation: its offset moves on at the permitted rate, and its holds remain."""
-        self._limiter.offset_um = handover.offset_um
-        memory, zero = self._memory, self._zero
-        memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
-        memory.model_changed = handover.model_changed
-        self.outputs.continue_from(handover.further, model_changed=handover.model_changed)
+        self.take_offsets(handover.offset_um, handover.further)
+        self.take_holds(operator_hold=handover.operator_hold, internal_error=handover.internal_error)
+        zero, self._memory.model_changed = self._zero, handover.model_changed
+        for state in self.outputs.states.values():
+            state.model_changed = handover.model_changed
         zero.wanted, zero.mode = handover.waiting_zero is not None, handover.waiting_zero or zero.mode
         if self.probing is not None and handover.probing is not None:
             self.probing.continue_from(handover.probing)
+
+    def take_offsets(self, offset_um: float, further: Mapping[str, float]) -> None:
+        """Go on from other offsets than its own, that of Y, µm, and further outputs by name; all else stays."""
+        self._limiter.offset_um = offset_um
+        self.outputs.take_offsets(further)
+
+    def take_holds(self, *, operator_hold: bool, internal_error: bool) -> None:
+        """Hold the offset until `resume` for these causes, and for no other of them."""
+        self._memory.operator_hold, self._memory.internal_error = operator_hold, internal_error
 
     def raise_level(self, um: float) -> None:
         """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""

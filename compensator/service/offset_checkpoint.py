@@ -1,4 +1,4 @@
-"""Keeps the last offset that was published before it was on disk, so that it survives a kill of the service.
+"""Keeps the last offset that was published before it was on disk, and its holds, so that they survive a kill.
 
 After a kill the service continues from the last offset on disk. If the disk was full or hung, later offsets are missing
 there, and the offset would jump back. The last published offset is therefore kept in a file in memory, which survives a
@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 from compensator.atomic_write import replace_file
-from compensator.codes import Remark, ServiceWarning
+from compensator.codes import Reason, Remark, ServiceWarning
 from compensator.messages import UNREADABLE, Number, Offset, SampleNumber, TimeNs, number
 
 log = logging.getLogger("compensator")
@@ -31,13 +31,16 @@ _LONGEST = 4096
 class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """An offset that was published before it was on disk; the fields are those of `Offset`.
 
-    `further` are the values of further outputs by name, each in its unit.
+    `further` are the values of further outputs by name, each in its unit; `operator_hold` and `internal_error` say why
+    the offset was held until `resume`.
     """
 
     seq: SampleNumber
     time_utc_ns: TimeNs
     y_offset_um: Number
     further: dict[str, Number] = {}
+    operator_hold: bool = False
+    internal_error: bool = False
 
 
 class OffsetCheckpoint:
@@ -73,7 +76,12 @@ class OffsetCheckpoint:
             return
         known = {name: one for name, one in (further or {}).items() if not math.isnan(one)}
         checkpointed = CheckpointedOffset(
-            seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value, further=known
+            seq=offset.seq,
+            time_utc_ns=offset.time_utc_ns,
+            y_offset_um=value,
+            further=known,
+            operator_hold=Reason.OPERATOR_HOLD in offset.reasons,
+            internal_error=Reason.INTERNAL_ERROR in offset.reasons,
         )
         try:
             replace_file(self.path, msgspec.json.encode(checkpointed), mode=0o600, sync=False)

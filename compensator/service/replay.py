@@ -313,10 +313,7 @@ class FreeRun:
                     f"{step.file}: samples of {sample.period_s:g} s, expected those of the model, {period_s:g} s"
                 )
             if self._before_torn_um is not None:
-                own = compensation.status.handover
-                offset_um, further = self._before_torn_um, self._further_before_torn
-                other = msgspec.structs.replace(own, offset_um=offset_um, further=further, probing=None)
-                compensation.continue_from(other)
+                compensation.take_offsets(self._before_torn_um, self._further_before_torn)
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             before = compensation.status.handover

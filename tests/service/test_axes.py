@@ -23,6 +23,7 @@ from compensator.messages_axes import AXES_MESSAGES, AxesEstimate, further_value
 from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import Path as ModelPath
+from compensator.model.thermal_model import ThermalModel
 from compensator.recording.live_file import RecordingFile
 from compensator.recording.reading import messages
 from compensator.service.compensation import Compensation, Outcome, model_of
@@ -349,12 +350,16 @@ def test_a_zero_before_the_record_is_that_of_every_axis() -> None:
         assert again[name] == outcome.estimate.axes[name] != 0.0  # type: ignore[attr-defined]
 
 
+def of_strength(name: str, numerator: float) -> ThermalModel:
+    """A part of the model with another gain of its DTF."""
+    own = part(name)
+    dtf = dataclasses.replace(own.dtf.continuous, numerator=(numerator,))  # type: ignore[type-var]
+    return dataclasses.replace(own, dtf=type(own.dtf).from_continuous(dtf, 60.0))
+
+
 def test_a_model_of_all_axes_is_adopted_and_the_offsets_do_not_jump(tmp_path: Path) -> None:
     machine = SeveralAxes(tmp_path, config_text(AXES), model_text("y", "x", "z"))
-    stronger = part("z")
-    dtf = dataclasses.replace(stronger.dtf.continuous, numerator=(1.5,))  # type: ignore[type-var]
-    stronger = dataclasses.replace(stronger, dtf=type(stronger.dtf).from_continuous(dtf, 60.0))
-    model = model_text("y", "x", parts={"z": stronger})
+    model = model_text("y", "x", parts={"z": of_strength("z", 1.5)})
     asked: dict[str, Any] = {}
 
     def adopt(name: str, text: bytes) -> Any:
@@ -368,6 +373,28 @@ def test_a_model_of_all_axes_is_adopted_and_the_offsets_do_not_jump(tmp_path: Pa
     z = [by_axis(outcome)["z"] for outcome in machine.outcomes]
     assert len({one.model_sha256 for one in z}) == 2
     assert np.abs(np.diff([one.y_offset_um for one in z])).max() < 8.0 + 1e-9
+    assert audit(machine.recordings).clean
+
+
+def test_after_a_restart_each_axis_says_whether_its_own_offset_still_moves_to_that_of_a_model(tmp_path: Path) -> None:
+    """Z has a model that is far off and Y the same as before: of Y it is no reason, before the restart and after it."""
+    machine = SeveralAxes(tmp_path, config_text(AXES), model_text("y", "x", "z"))
+    model = model_text("y", "x", parts={"z": of_strength("z", 10.0)})
+    payload = json.dumps({"model": model.decode(), "force": True}).encode()
+
+    def moving(outcome: Outcome) -> list[str]:
+        return [axis for axis, one in by_axis(outcome).items() if "model_changed" in one.reasons]
+
+    def stop_while_z_moves() -> None:
+        if moving(machine.outcomes[-1]) == ["z"] and machine.daemon is not None:
+            machine.daemon.stop()
+
+    machine.run(
+        200, {120: lambda: machine.command("adopt", payload)} | dict.fromkeys(range(121, 200), stop_while_z_moves)
+    )
+    stopped = len(machine.outcomes)
+    machine.run(1)
+    assert stopped < 200 and [moving(outcome) for outcome in machine.outcomes[-2:]] == [["z"], ["z"]]
     assert audit(machine.recordings).clean
 
 

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from compensator.audit.series import audit
@@ -48,6 +49,32 @@ async def test_killed_on_a_full_disk_the_offset_does_not_leap_back(
     assert {finding.kind for finding in audit(recordings(machine.recordings, MACHINE)).findings} == {"unreadable"}
 
 
+@pytest.mark.parametrize("command", ["hold", "resume"])
+async def test_a_command_on_a_full_disk_acts_after_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """An operator who has frozen the offset need not watch whether the disk took the command, or the service lived."""
+    machine, write = slow_machine(tmp_path), recorder_module.McapRecorder.write
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    if command == "resume":
+        machine.at_sample[50] = lambda: machine.command("hold")
+    machine.at_sample[60] = lambda: monkeypatch.setattr(recorder_module.McapRecorder, "write", full)
+    machine.at_sample[70] = lambda: machine.command(command)
+    await machine.run_and_kill(100)
+    monkeypatch.setattr(recorder_module.McapRecorder, "write", write)
+    machine.at_sample[110] = lambda: machine.command("resume")
+    await machine.run(20)
+    held = ["operator_hold" in outcome.offset.reasons for outcome in machine.outcomes]
+    if command == "hold":
+        assert held == [False] * 70 + [True] * 40 + [False] * 10
+        assert len({outcome.offset.y_offset_um for outcome in machine.outcomes[70:110]}) == 1
+    else:
+        assert held == [False] * 50 + [True] * 20 + [False] * 50
+
+
 async def test_while_the_disk_takes_everything_nothing_is_noted(tmp_path: Path) -> None:
     machine = slow_machine(tmp_path)
     await machine.run(10)
@@ -77,7 +104,11 @@ def test_the_note_is_of_one_machine_and_its_newest(tmp_path: Path) -> None:
     note.write(offset(float("nan"), 8))  # nothing was published that a control could apply
     note.write(offset(-2.5, 9))
     assert note.read(100.0) == CheckpointedOffset(seq=9, time_utc_ns=5, y_offset_um=-2.5)
+    assert b"hold" not in note.path.read_bytes()  # a service before these keys reads it, too
     assert other.read(100.0) is None and note.path.stat().st_mode & 0o777 == 0o600
+    note.write(msgspec.structs.replace(offset(-2.5, 9), reasons=["operator_hold", "internal_error"]))
+    held = CheckpointedOffset(seq=9, time_utc_ns=5, y_offset_um=-2.5, operator_hold=True, internal_error=True)
+    assert note.read(100.0) == held
     assert note.read(2.0) is None  # beyond the limit: no service published that
     note.remove()
     note.remove()

@@ -8,7 +8,6 @@ configuration or the model has changed since, a new compensation is warmed up on
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,12 +40,6 @@ class Resumed:
     def note(self, text: str, **data: Any) -> None:
         """Add an event."""
         self.notes.append(Note(EventKind.RESTART, text, data))
-
-    def continue_from(self, offset_um: float, further: Mapping[str, float]) -> None:
-        """Continue from other offsets than the compensation's own: that of Y, µm, and further outputs by name."""
-        own = self.compensation.status.handover
-        other = msgspec.structs.replace(own, offset_um=offset_um, further=further, probing=None)
-        self.compensation.continue_from(other)
 
 
 @dataclass(slots=True)
@@ -115,7 +108,10 @@ def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: Checkpointed
     """
     resumed = _from_disk(loaded, model)
     if checkpointed is not None and checkpointed.seq > resumed.compensation.status.seq:
-        resumed.continue_from(checkpointed.y_offset_um, checkpointed.further)
+        resumed.compensation.take_offsets(checkpointed.y_offset_um, checkpointed.further)
+        resumed.compensation.take_holds(
+            operator_hold=checkpointed.operator_hold, internal_error=checkpointed.internal_error
+        )
         resumed.note(
             f"continues from the offset {checkpointed.y_offset_um:.3f} µm of sample {checkpointed.seq}, "
             "which was published while the disk failed",
@@ -211,7 +207,7 @@ def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, dif
     resumed.compensation = compensation
     if last.samples:
         # The offset of a torn last sample was computed but not published.
-        resumed.continue_from(last.handover.offset_um, last.handover.further)
+        compensation.take_offsets(last.handover.offset_um, last.handover.further)
     status = compensation.status
     resumed.note(
         f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {status.seq}",
