@@ -148,6 +148,13 @@ class Commands:
             except ServiceError as error:
                 self._note_refusal(name, f"{name}: {error}", sender)
 
+    def refuse_waiting(self) -> None:
+        """Note of each command that was accepted for the next sample that it did not act: the service ends before."""
+        while not self._waiting.empty():
+            name, _, sender = self._waiting.get_nowait()
+            text = f"{name}: the service ended before the next sample; send it again"
+            self._events.note(EventKind.COMMAND_REFUSED, text, {"name": name, "ok": False} | sender.data())
+
     def _answer(self, compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
         """Pass a command on to the loop; the candidate that was meant may have given its place since the answer."""
         if self._models is None:

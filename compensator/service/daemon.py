@@ -295,6 +295,7 @@ class Daemon:
                 opening=self._opening(),
                 probes=[*unread, *undecided],
             )
+        self._commands.refuse_waiting()
         await self._journal.close(self._compensation.state(), self._opening())
         await self._sampler.close()
 

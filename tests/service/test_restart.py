@@ -13,7 +13,7 @@ import pytest
 from compensator.config import LoadedConfig
 from compensator.messages import number
 from compensator.model.model_file import load_model, read_model_bytes
-from compensator.recording.reading import decode, read_messages, recordings
+from compensator.recording.reading import decode, messages, read_messages, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.transfer.restart import resume
 from drivers.reading import Quality, Reading
@@ -150,6 +150,27 @@ def break_next_sample(machine: Machine) -> None:
         raise ZeroDivisionError("a defect")
 
     compensation._decision.decide = broken  # type: ignore[method-assign]
+
+
+async def test_a_command_that_no_sample_follows_is_recorded_as_refused(tmp_path: Path) -> None:
+    """It was answered that it acts at the next sample: who sent it must find that it did not."""
+    machine, replies = Machine(tmp_path), []
+
+    def send_and_stop() -> None:
+        replies.extend(machine.command(name) for name in ["zero", *["resume"] * 20, "hold"])
+        assert machine.daemon is not None
+        machine.daemon.stop()
+
+    machine.at_sample[100] = send_and_stop
+    await machine.run(200)
+    await machine.run(5)
+    assert len(machine.outcomes) == 105 and all(reply["ok"] for reply in replies)
+    sent = [event for path in recordings(machine.recordings, MACHINE) for event in messages(path, ("event",))]
+    commands = [event for event in sent if event.kind in ("command", "command_refused")]
+    assert [event.data["name"] for event in commands] == ["zero", *["resume"] * 20, "hold"]
+    assert commands[-1].text == "hold: the service ended before the next sample; send it again"
+    assert commands == machine.events("command_refused")
+    assert "operator_hold" not in machine.outcomes[-1].offset.reasons
 
 
 @pytest.mark.parametrize("changed", ["nothing", "configuration", "model", "state lost", "no zero on record"])
