@@ -269,7 +269,7 @@ class ProbeCode(Code):
     )
     TOO_OLD = (
         "probe_too_old",
-        "The probe arrived later than probe.oldest_min.",
+        "The probe arrived later than probe.oldest_min, or is older than the 300 samples that are kept.",
         "Send probes at once; check the clocks of the control and of this computer.",
     )
     DUPLICATE = ("probe_duplicate", "The same probe was received before.", "Nothing, if it was sent again on purpose.")
@@ -713,6 +713,11 @@ class ServiceWarning(Code):
         "probe_bounds",
         "Probes that show the largest permitted correction are refused: probe.measured_max_um is below it.",
         "Set probe.measured_max_um to about three times probe.largest_um.",
+    )
+    PROBE_OLDEST = (
+        "probe_oldest",
+        "A probe may be less old than probe.oldest_min says: only the last 300 samples are kept.",
+        "Set probe.oldest_min to what the samples cover, and send probes at once.",
     )
     HEAD_NOT_WRITABLE = (
         "head_not_writable",

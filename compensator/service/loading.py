@@ -15,7 +15,7 @@ import drivers
 from compensator.axes import column_of
 from compensator.certificates import Certificate, check_files, remarks
 from compensator.codes import Remark, ServiceWarning
-from compensator.config import Config, LoadedConfig, Zenoh, load_config
+from compensator.config import ROLES, Config, LoadedConfig, Zenoh, load_config
 from compensator.data.table import is_taken
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.input_file import resolved
@@ -23,6 +23,7 @@ from compensator.model.model_file import read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.signature import Signer
 from compensator.service.compensation import model_of
+from compensator.service.probing.probing import MOST_SAMPLES
 from compensator.service.session import tls_files
 from compensator.service.transfer.model_store import ModelStore, check_model
 from drivers.errors import DriverConfigError
@@ -110,6 +111,13 @@ class Setup:
                 "a probe that shows such an error is refused."
             )
             found.append(Remark(ServiceWarning.PROBE_BOUNDS, figures))
+        longest_min = MOST_SAMPLES * self.model.period_s / 60.0
+        if probe is not None and probe.oldest_min > longest_min:
+            figures = (
+                f"probe.oldest_min = {probe.oldest_min:g} is more than {MOST_SAMPLES} samples of "
+                f"{self.model.period_s:g} s: an older probe than {longest_min:.3g} min is refused."
+            )
+            found.append(Remark(ServiceWarning.PROBE_OLDEST, figures))
         found += _unwritable_head(self.head, self.recordings)
         if zenoh.secured():
             now = now or datetime.datetime.now(datetime.UTC)
@@ -135,6 +143,10 @@ def load(path: str) -> Setup:
     if taken := [name for name in channels if is_taken(name, channels)]:
         words = "`export` writes another column of this name, expected a name of its own"
         raise ConfigError(f"{path}: channel {taken[0]!r}: {words}")
+    rest = config.plausibility.rest if config.plausibility is not None else None
+    if rest is not None and rest.channel in ROLES[:3]:
+        words = "which says nothing of a machine at rest, expected a channel such as heat_w or spindle_rpm"
+        raise ConfigError(f"{path}: plausibility.rest.channel = {rest.channel!r}: {words}")
     folder = loaded.resolve(config.recording.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{path}: recording.folder = {config.recording.folder!r}: is a file, expected a folder")

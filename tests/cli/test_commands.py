@@ -265,6 +265,7 @@ def test_bad_tables_get_one_line_and_exit_2(
 
 
 PROBE_TABLE = "[probe]\nstd_um = 1.0\nmeasured_max_um = 60.0\nlargest_um = 40.0\n"
+REST_TABLE = '[plausibility.rest]\nchannel = "NAME"\nat_most = 100.0\nafter_min = 60.0\nt_q_at_max_k = 0.5\n'
 LISTEN = 'listen = ["tcp/127.0.0.1:7447"]'
 BAD_CONFIGS = [
     (
@@ -313,6 +314,10 @@ BAD_CONFIGS = [
         'folder = "recordings"',
         'folder = "recordings\\n"',
         "recording.folder = 'recordings\\n': has a control character",
+    ),
+    *(
+        ("[machine]", REST_TABLE.replace("NAME", name) + "[machine]", f"plausibility.rest.channel = {name!r}: {words}")
+        for name, words in (("y_um", "which says"), ("at_degc", "which says"), ("spindle", "no such channel"))
     ),
     ("[machine]", PROBE_TABLE + "often = true\n[machine]", "probe.often: no such key, expected one of: std_um"),
 ]

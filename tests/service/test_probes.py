@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import math
 import re
@@ -20,18 +21,22 @@ from compensator.audit.series import Audit, audit
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.codes import ProbeCode
+from compensator.config import Probe as ProbeSettings
 from compensator.config import Zenoh
 from compensator.demo.machine import configuration
 from compensator.errors import ServiceError
 from compensator.messages import ProbeRequest, number
 from compensator.model.correction import ProbeCorrection
 from compensator.model.model_file import parse_model
+from compensator.model.thermal_model import Path as ModelPath
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
 from compensator.service.compensation import Compensation
+from compensator.service.loading import load
 from compensator.service.probing.past import offsets_at, predicted_at, published_at
-from compensator.service.probing.received import ProbeRefused, read_probe
+from compensator.service.probing.probing import Probing
+from compensator.service.probing.received import ProbeRefused, ReceivedProbe, read_probe
 from compensator.service.probing.state import PastSample, ProbingState
 from compensator.service.probing.wanted import wanted_after
 from compensator.service.publisher import Publisher
@@ -41,6 +46,7 @@ from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
 from tests.service.living import MACHINE, check_files, largest_step
 from tests.service.probed import PROBE, PROBED, RATE_UM, ProbedMachine
+from tests.service.simulated import START_NS
 from tests.service.test_compensation_day import MISSING
 
 MINUTE_NS = 60 * NS
@@ -599,14 +605,20 @@ async def test_the_time_by_which_a_probe_is_wanted_comes_true(tmp_path: Path) ->
     assert abs(last["wanted_by_ns"] - first["time_utc_ns"]) < 25 * MINUTE_NS
 
 
-def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def written(folder: Path, table: bytes) -> Path:
+    """Write the configuration of a machine with a table of probes."""
     text = configuration(
         "vmc-07", {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 1, "command": 2}, 7447
     )
-    path = tmp_path / "machine.toml"
-    path.write_bytes(text.encode() + PROBE.replace(b"tolerance_um = 3.0", b"tolerance_um = 0.5"))
+    path = folder / "machine.toml"
+    path.write_bytes(text.encode() + table)
+    return path
+
+
+def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, PROBE.replace(b"tolerance_um = 3.0", b"tolerance_um = 0.5"))
     assert main(["check", "--config", str(path)]) == 0
     said = capsys.readouterr()
     assert (
@@ -614,9 +626,43 @@ def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
         and "probes: on, one value ±1 µm, at most 60 µm, correction at most 40 µm" in said.out
     )
     assert "tolerance 0.5 µm" in said.out and "probe_bounds" not in said.err
-    path.write_bytes(text.encode() + PROBE.replace(b"measured_max_um = 60.0", b"measured_max_um = 30.0"))
+    written(tmp_path, PROBE.replace(b"measured_max_um = 60.0", b"measured_max_um = 30.0"))
     assert main(["check", "--config", str(path)]) == 0
     assert "[probe_bounds]" in capsys.readouterr().err
+
+
+def test_probes_older_than_the_samples_that_are_kept_are_warned_of_and_refused_by_that_name(tmp_path: Path) -> None:
+    """300 samples of 5 s are 25 min, and the default is 30."""
+    settings = ProbeSettings(std_um=1.0, measured_max_um=60.0, largest_um=40.0)
+    probing = Probing(settings, ["DTF", "TDTF"], offset_max_um=200.0, period_s=5.0)
+
+    def code(age_min: float) -> str:
+        time_ns = START_NS - round(age_min * MINUTE_NS)
+        request = ProbeRequest(
+            schema=1, time_utc_ns=time_ns, axis="y", measured_um=1.0, offset_applied_um=0.0, feature="bore"
+        )
+        try:
+            probing.check(ReceivedProbe(request=request, received_utc_ns=START_NS))
+        except ProbeRefused as refused:
+            return refused.code
+        return ""
+
+    for at in range(360):
+        probing.add(
+            PastSample(START_NS - (359 - at) * 5 * NS, 0.0, 0.0, (0.0, 0.0), 0.1, math.nan, math.nan, False)
+        )
+        probing.publish(0.0, 0.0, is_held=False)
+        if at == 100:
+            assert code(29.95) == ProbeCode.TIME_UNKNOWN  # before the first one: no other was forgotten
+    assert [code(minutes) for minutes in (24.9, 26.0, 29.9, 30.1)] == ["", *[ProbeCode.TOO_OLD] * 3]
+
+    setup = load(str(written(tmp_path, PROBE)))
+    assert not any(remark.code == "probe_oldest" for remark in setup.warnings())
+    paths = {name: getattr(setup.model, name).continuous for name in ("ttf", "dtf", "tdtf")}
+    sampled: dict[str, Any] = {name: ModelPath.from_continuous(one, 5.0) for name, one in paths.items()}
+    short = dataclasses.replace(setup, model=dataclasses.replace(setup.model, period_s=5.0, **sampled))
+    (remark,) = (remark for remark in short.warnings() if remark.code == "probe_oldest")
+    assert "probe.oldest_min = 30 is more than 300 samples of 5 s: an older probe than 25 min" in remark
 
 
 async def test_the_first_probe_is_asked_for(tmp_path: Path) -> None:

@@ -22,7 +22,13 @@ STD_UM = (0.01, 100.0)
 
 
 def check_probe(
-    probe: ReceivedProbe, state: ProbingState, settings: ProbeSettings, *, offset_max_um: float, period_s: float
+    probe: ReceivedProbe,
+    state: ProbingState,
+    settings: ProbeSettings,
+    *,
+    offset_max_um: float,
+    period_s: float,
+    kept: int,
 ) -> None:
     """Check a probe against its bounds, its time, and what was published then.
 
@@ -38,6 +44,8 @@ def check_probe(
         Largest offset, µm.
     period_s : float
         Length of a sample, s.
+    kept : int
+        Number of samples that are kept.
 
     Raises
     ------
@@ -45,7 +53,7 @@ def check_probe(
         If it cannot be used; the message says why.
     """
     _check_bounds(probe, settings, offset_max_um)
-    _check_time(probe, state, settings, period_s)
+    _check_time(probe, state, settings, period_s, kept)
     if not probe.is_checked:
         _check_offset(probe, state, settings, period_s)
     request = probe.request
@@ -72,7 +80,7 @@ def _check_bounds(probe: ReceivedProbe, settings: ProbeSettings, offset_max_um: 
         )
 
 
-def _check_time(probe: ReceivedProbe, state: ProbingState, settings: ProbeSettings, period_s: float) -> None:
+def _check_time(probe: ReceivedProbe, state: ProbingState, settings: ProbeSettings, period_s: float, kept: int) -> None:
     time_ns, samples = probe.request.time_utc_ns, state.samples
     when, late_s = _clock(time_ns), (probe.received_utc_ns - time_ns) / NS
     if late_s < -AHEAD_S:
@@ -88,6 +96,9 @@ def _check_time(probe: ReceivedProbe, state: ProbingState, settings: ProbeSettin
         raise ProbeRefused(ProbeCode.BEFORE_ZERO, f"probe of {when}: before the zero of {_clock(state.zero_ns)}")
     if not samples:
         raise ProbeRefused(ProbeCode.NO_OFFSET, f"probe of {when}: no offset had been published by then")
+    if len(samples) >= kept and time_ns < samples[0].middle_ns:
+        since = f"before the oldest sample that is kept, of {_clock(samples[0].time_ns)}"
+        raise ProbeRefused(ProbeCode.TOO_OLD, f"probe of {when}: {since}")
     if predicted_at(samples, time_ns, period_s) is None:
         raise ProbeRefused(ProbeCode.TIME_UNKNOWN, f"probe of {when}: there is no prediction for that time")
 

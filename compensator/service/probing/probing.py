@@ -32,7 +32,7 @@ from compensator.service.probing.wanted import Wanted, wanted_after
 #: Samples that are kept beyond `probe.oldest_min`: a probe is compared with the one after it, and waits for a sample.
 _MORE_SAMPLES = 4
 #: Largest number of samples that are kept: they are a part of the state, which is encoded at each sample.
-_MOST_SAMPLES = 300
+MOST_SAMPLES = 300
 #: Largest number of compared probes that are kept to recognise duplicates.
 _KNOWN = 100
 #: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
@@ -85,7 +85,7 @@ class Probing:
         self._names = tuple(names)
         self._offset_max_um = offset_max_um
         self._period_s = period_s
-        self._kept = min(math.ceil(60.0 * settings.oldest_min / period_s), _MOST_SAMPLES) + _MORE_SAMPLES
+        self._kept = min(math.ceil(60.0 * settings.oldest_min / period_s), MOST_SAMPLES) + _MORE_SAMPLES
         self._correction = ProbeCorrection(names)
         self._state = ProbingState(correction={})
 
@@ -245,6 +245,7 @@ class Probing:
             self._settings,
             offset_max_um=self._offset_max_um,
             period_s=self._period_s,
+            kept=self._kept,
         )
 
     def decide(self, machine: str, seq: int, probe: ReceivedProbe) -> tuple[Probe, Note, float]:
