@@ -648,9 +648,7 @@ def test_probes_older_than_the_samples_that_are_kept_are_warned_of_and_refused_b
         return ""
 
     for at in range(360):
-        probing.add(
-            PastSample(START_NS - (359 - at) * 5 * NS, 0.0, 0.0, (0.0, 0.0), 0.1, math.nan, math.nan, False)
-        )
+        probing.add(PastSample(START_NS - (359 - at) * 5 * NS, 0.0, 0.0, (0.0, 0.0), 0.1, math.nan, math.nan, False))
         probing.publish(0.0, 0.0, is_held=False)
         if at == 100:
             assert code(29.95) == ProbeCode.TIME_UNKNOWN  # before the first one: no other was forgotten
