@@ -59,6 +59,11 @@ class Sampling(_Table, frozen=True, kw_only=True):
     poll_interval_s: Annotated[float, Meta(ge=0.01, le=3600)] = 1.0
     min_good_fraction: Annotated[float, Meta(ge=0.001, le=1)] = 0.5
 
+    def polls_of(self, period_s: float) -> int | None:
+        """Return the number of polls in a sample of a length, s; None if it is not a whole one."""
+        polls = period_s / self.poll_interval_s
+        return round(polls) if polls >= 1.0 and abs(polls - round(polls)) <= 1e-9 else None
+
 
 class Channel(_Table, frozen=True, kw_only=True):
     """`[[channel]]`: one measured quantity and its plausible values.

@@ -114,8 +114,18 @@ class Sample(Message, frozen=True, kw_only=True):
     @property
     def behind_ns(self) -> int:
         """How far before its end the middle of its polls is, ns; each is at the end of its part of the sample."""
-        polls = max([1, *(channel.polls for channel in self.channels.values())])
-        return round(0.5 * (1.0 - 1.0 / polls) * self.period_s * 1e9)
+        return self.behind_of(None)
+
+    def behind_of(self, polls: int | None) -> int:
+        """Return how far before its end the middle of its polls is, ns.
+
+        Parameters
+        ----------
+        polls : int or None
+            Number of polls of a whole sample; None if this is one. The first sample of a start has the last of them.
+        """
+        own = max([1, *(channel.polls for channel in self.channels.values())])
+        return round(0.5 * (own - 1) / max(polls or 0, own) * self.period_s * 1e9)
 
 
 class EstimateMessage(Message, frozen=True, kw_only=True):

@@ -249,7 +249,7 @@ class Compensation(Continuity):
                     offset_um=NAN,
                     offset_rate_um_per_min=NAN,
                     is_held=False,
-                    behind_ns=raw.behind_ns,
+                    behind_ns=raw.behind_of(self._config.sampling.polls_of(self.model.period_s)),
                 )
             )
 

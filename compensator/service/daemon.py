@@ -180,7 +180,8 @@ class Daemon:
         """
         self._commands.open()
         period_s = self._compensation.model.period_s
-        polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
+        polls = self._config.sampling.polls_of(period_s)
+        assert polls is not None  # checked with the model
         grid = Grid(self._clock, period_s, polls)
         self._events.note(EventKind.START, f"compensator {__version__} with model {self._compensation.model.name}")
         for kind, text, data in self._earlier:
@@ -501,8 +502,9 @@ class Daemon:
             `zero`, `hold`, `resume`, `adopt`, `back`, `dismiss` or `probe`.
         payload : bytes
             Empty or a JSON object. `zero` has `mode`: `auto`, `rest` or `warm`; `adopt` has `model`, the text of a
-            model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` have `force`. That of
-            `probe` is a `ProbeRequest`.
+            model file, or `sha256`, that of one adopted before, or both, or `candidate`, true for the candidate of the
+            loop, with `sha256` for the one of these first digits, as `dismiss` has; `adopt` and `back` have `force`.
+            That of `probe` is a `ProbeRequest`.
         sender : Sender
             Sender; recorded in the event.
 

@@ -151,8 +151,7 @@ def load(path: str) -> Setup:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{path}: recording.folder = {config.recording.folder!r}: is a file, expected a folder")
     model, model_bytes, store = _model(loaded)
-    polls = model.period_s / config.sampling.poll_interval_s
-    if abs(polls - round(polls)) > 1e-9 or polls < 1:
+    if config.sampling.polls_of(model.period_s) is None:
         raise ConfigError(
             f"{path}: sampling.poll_interval_s = {config.sampling.poll_interval_s:g}, "
             f"expected the model's {model.period_s:g} s divided by an integer"

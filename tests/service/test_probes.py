@@ -726,6 +726,21 @@ async def test_a_prediction_belongs_to_the_middle_of_its_polls(
     assert last.time_ns - last.middle_ns == behind_s * NS
 
 
+@pytest.mark.parametrize(("interval_s", "begin_s", "behind_s"), [(20.0, 30, 10.0), (20.0, 45, 0.0), (1.0, 45, 7.0)])
+async def test_the_polls_of_a_first_sample_are_its_last(
+    tmp_path: Path, interval_s: float, begin_s: int, behind_s: float
+) -> None:
+    """A service that starts within a sample has only its end: the polls are as far apart as in a whole one."""
+    config = PROBED.replace(b"poll_interval_s = 60.0", f"poll_interval_s = {interval_s}".encode())
+    machine = ProbedMachine(tmp_path, config=config)
+    await machine.clock.sleep(begin_s)
+    await machine.run(2)
+    assert machine.daemon is not None
+    state = decode_state(machine.daemon._compensation.state()).probing
+    assert state is not None
+    assert [sample.behind_ns for sample in state.samples] == [behind_s * NS, 0.5 * (60.0 - interval_s) * NS]
+
+
 def test_the_offset_of_a_time_is_followed_with_its_rate_and_expires() -> None:
     samples = past((1, 10.0, -10.0), (2, 12.0, -13.0), (3, 12.0, math.nan))
     assert offsets_at(samples, round(2.5 * MINUTE_NS), 60.0) == pytest.approx((-13.5, -10.0))

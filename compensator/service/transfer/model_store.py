@@ -198,8 +198,7 @@ def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
     except CompensatorError as error:
         text = str(error)
         raise ModelError(text if text.startswith(f"{source}: ") else f"{source}: {text}") from error
-    polls = model.period_s / config.sampling.poll_interval_s
-    if abs(polls - round(polls)) > 1e-9 or polls < 1:
+    if config.sampling.polls_of(model.period_s) is None:
         raise ModelError(
             f"{source}: sample_period_s = {model.period_s:g}, "
             f"expected a whole multiple of sampling.poll_interval_s = {config.sampling.poll_interval_s:g}"
