@@ -149,7 +149,7 @@ def test_a_machine_with_y_alone_says_what_it_said(day: Any) -> None:  # noqa: F8
     found = day.opinion(QUILL, gain(0.4))
     assert found.table().keys() == {
         "verdict", "measured_by", "hours", "samples", "present_rms_um", "candidate_rms_um", "deviations", "effective",
-        "offset_change_um",
+        "offset_change_um", "ratio",
     }  # fmt: skip
     assert described(found).startswith("last 11.7 h: present ")
     with pytest.raises(ServiceError, match=r"\) is clearly worse: last 11\.7 h: present .* measured Y is right"):

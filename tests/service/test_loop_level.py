@@ -244,6 +244,20 @@ def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, o
     assert found.is_better_to_go_back_to(is_new=False) is is_right
 
 
+@pytest.mark.parametrize(
+    ("other_um", "same", "y_moved", "is_better"),
+    [(0.1, True, False, True), (0.4, True, False, False), (0.1, False, False, False), (0.1, True, True, False)],
+)
+def test_newer_parameters_that_alone_are_right_about_the_zero_are_better(other_um, same, y_moved, is_better):
+    """The present ones leave nearly a constant, which changes do not show."""
+    means = [(2.4 + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(30)]
+    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
+    present = ErrorBlocks(blocks=[(n, 2.4) for n in range(-20, 30)])
+    found = Compared(place, settings().loop, 60.0, present, same=same, y_moved=y_moved)
+    assert found.is_better(30 * BLOCK_NS) is is_better
+
+
 def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):
     wrong = 1600
     monkeypatch.setattr(loop_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)

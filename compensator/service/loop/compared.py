@@ -135,13 +135,17 @@ class Compared:
         return was_compared
 
     def is_better(self, now_ns: int) -> bool:
-        """Return whether a candidate has shown enough, and in its own hours, too."""
+        """Return whether a candidate has shown enough, and in its own hours, too.
+
+        Newer parameters of the present effects have, if they alone are right about the zero: nearly a constant, which
+        the present ones leave, is shown by no change.
+        """
         place = self._place
         compared_h = (now_ns - place.since_utc_ns) / HOUR_NS
-        found = is_clearly_better(place.verdict) and is_enough(
-            place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
-        )
-        return found and self._is_itself_better
+        enough = is_enough(place.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h)
+        if enough and self._same and not self._y_moved and self._is_alone_near_zero:
+            return True
+        return enough and is_clearly_better(place.verdict) and self._is_itself_better
 
     def is_better_to_go_back_to(self, *, is_new: bool) -> bool:
         """Return whether a way back is better, and in its own hours, too.
@@ -168,14 +172,21 @@ class Compared:
         to where the other model happens to be right is as unlikely as its error is small beside that of the present.
         Where the present model has been as wrong all the time, nothing has ended: it is the level that is wrong.
         """
+        if not self._is_alone_near_zero:
+            return False
+        residuals_um = self._comparison.residuals_um
+        own_um = rms_of(np.array(residuals_um).T[1])
+        before = [mean for block, mean in self._present_error.blocks if block < residuals_um[0][0]]
+        return len(before) < FEWEST or sum(abs(mean) < QUIET * own_um for mean in before) >= FEWEST
+
+    @property
+    def _is_alone_near_zero(self) -> bool:
+        """Whether only the other model is right about the zero, and its changes are no worse."""
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
         if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
             return False
         own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
-        before = [mean for block, mean in self._present_error.blocks if block < residuals_um[0][0]]
-        if len(before) >= FEWEST > sum(abs(mean) < QUIET * own_um for mean in before):
-            return False
-        return other_um <= ALONE_PART * own_um and other_um > 0.0
+        return 0.0 < other_um <= ALONE_PART * own_um
 
     @property
     def _is_itself_better(self) -> bool:
