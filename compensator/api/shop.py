@@ -130,10 +130,8 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
     config = msgspec.structs.replace(config, loop=Loop(policy=policy))
-    alone, followed = (
-        _Summary("", "", is_recorded=False),
-        _Followed(LoopRun(config, file, diagnosis_in_process(config))),
-    )
+    alone = _Summary("", "", is_recorded=False)
+    followed = _Followed(LoopRun(config, file, diagnosis_in_process(config)))
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
     for step in _steps(paths, summary.cut):
         outcome, first = of_loop.process(step), of_first.process(step)

@@ -22,7 +22,7 @@ from compensator.data import mat_reader
 from compensator.data.cells import text_of, with_points
 from compensator.data.frames import table_in_memory
 from compensator.data.mat_reader import DAMAGED
-from compensator.data.probed import measured_probes, zeros_ns
+from compensator.data.probed import measured_probes, with_probes, zeros_ns
 from compensator.data.table import DATA_ROLES, TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Event, Probe, number
@@ -230,12 +230,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
         zeros = [time_ns for part in parts for time_ns in part.zeros_ns]
         probes, remarks = measured_probes(str(paths[0]), [part.probes for part in parts], zeros)
         if probes:
-            behind_ns = max(part.behind_ns for part in parts)
-            blank = np.full(len(probes), np.nan)
-            columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
-            values = [number(probe.deformation_um) for probe in probes]
-            columns["y_um"] = np.concatenate([np.full(t_s.size, np.nan), values])
-            t_s = np.concatenate([t_s, [(probe.time_utc_ns + behind_ns) / 1e9 for probe in probes]])
+            t_s, columns = with_probes(t_s, columns, probes, max(part.behind_ns for part in parts))
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks

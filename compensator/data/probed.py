@@ -5,9 +5,13 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.clock import NS
 from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.events import EventKind
-from compensator.messages import Event, Probe
+from compensator.messages import Event, Probe, number
 
 #: Why a probe is refused, too, if the control applied nothing.
 _APPLIED_NOTHING = (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD)
@@ -73,6 +77,30 @@ def of_one_level(probes: Iterable[Probe], zeros_ns: Iterable[int]) -> list[Probe
     for probe in probes:
         groups.setdefault((probe.feature, bisect_right(zeros, probe.time_utc_ns)), []).append(probe)
     return max(reversed(groups.values()), key=len, default=[])
+
+
+def with_probes(
+    t_s: Vector, columns: Mapping[str, Vector], probes: Sequence[Probe], behind_ns: int
+) -> tuple[Vector, dict[str, Vector]]:
+    """Return a table with a row of its own for each probe, whose `y_um` is what it showed, in order of time.
+
+    Parameters
+    ----------
+    t_s : array, shape (n,)
+        Times of the samples, their ends, s since 1970 UTC.
+    columns : mapping of str to array, shape (n,)
+        Columns without measured Y.
+    probes : sequence of Probe
+        The probes.
+    behind_ns : int
+        Time from the middle of the polls of a sample to its end: a probe's row is as much later than the probe, ns.
+    """
+    blank, shown = np.full(len(probes), np.nan), [number(probe.deformation_um) for probe in probes]
+    longer = {name: np.concatenate([values, blank]) for name, values in columns.items()}
+    longer["y_um"] = np.concatenate([np.full(t_s.size, np.nan), shown])
+    t_s = np.concatenate([t_s, [(probe.time_utc_ns + behind_ns) / NS for probe in probes]])
+    order = np.argsort(t_s, kind="stable")
+    return t_s[order], {name: values[order] for name, values in longer.items()}
 
 
 def _showing_deformation(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:

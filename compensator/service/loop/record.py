@@ -18,7 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
-from compensator.data.probed import of_one_level
+from compensator.data.probed import of_one_level, with_probes
 from compensator.data.screening import dead_part
 from compensator.data.table import Table
 from compensator.errors import DataError
@@ -88,7 +88,7 @@ def table_of_rows(
     if not np.isfinite(columns["y_um"]).any():
         # A sample in which the service began has fewer polls.
         behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
-        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
+        t_s, columns = with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
     return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
 
 
@@ -127,14 +127,3 @@ def _usable(
 
     usable = [probe for probe in probes if probe.taken and not is_left_out(probe.time_utc_ns / NS)]
     return of_one_level(usable, zeros_ns)
-
-
-def _with_probes(
-    t_s: Vector, columns: dict[str, Vector], probes: Sequence[Probe], behind_ns: int
-) -> tuple[Vector, dict[str, Vector]]:
-    blank, times = np.full(len(probes), np.nan), [(probe.time_utc_ns + behind_ns) / NS for probe in probes]
-    columns = {name: np.concatenate([values, blank]) for name, values in columns.items()}
-    columns["y_um"][t_s.size :] = [number(probe.deformation_um) for probe in probes]
-    t_s = np.concatenate([t_s, times])
-    order = np.argsort(t_s, kind="stable")
-    return t_s[order], {name: values[order] for name, values in columns.items()}
