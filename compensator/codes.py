@@ -594,6 +594,12 @@ class DataRemark(Code):
         "A zero was set between probes; from there a feature counts anew, so only those about one zero are used.",
         "Export the recordings of each zero to a table of their own: each table has a zero of its own.",
     )
+    SEVERAL_ZEROS = (
+        "several_zeros",
+        "A zero was set between probes; from there a feature counts anew. A diagnosis uses the probes about each zero; "
+        "errors in free run are those about the zero with most of them.",
+        "Nothing.",
+    )
     VARIABLES_LEFT_OUT = (
         "variables_left_out",
         "Variables of a MAT file that do not have one value per row, such as matrices, are not read.",

@@ -32,6 +32,7 @@ from compensator.data.measurement import (
     name_of,
     screened_runs_in,
 )
+from compensator.data.runs import Run
 from compensator.data.screening import require_y_noise
 from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import DiagnosisOptions
@@ -447,7 +448,8 @@ def _diagnose_axis(
     screened = partial(
         screened_runs_in, period_s=base.period_s, y_std_um=y_std_um, check=partial(require_channels, base)
     )
-    runs, remarks = screened(measured)
+    runs, remarks = screened(measured, every_zero=True)
+    remarks += _several_zeros(runs)
     require_y_noise(name_of(runs), runs)
     for one in validation:  # refused before the search, which may take minutes
         remarks += screened([one])[1]
@@ -480,6 +482,13 @@ def _diagnose_axis(
         since_utc_s=measured[0].since_utc_s,
         sources=tuple(sources),
     )
+
+
+def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
+    """Return a remark on runs in which Y counts from several zeros."""
+    count = sum(1 + len(run.zeros_s) for run in runs if run.zeros_s)
+    words = f"{name_of(runs)}: probes about {count} zeros; each has a level of its own in the search."
+    return [Remark(DataRemark.SEVERAL_ZEROS, words)] if count else []
 
 
 def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -161,14 +161,14 @@ def _end_of(table: Table, from_s: float) -> Table | None:
     columns = {name: values[kept] for name, values in table.columns.items()}
     if kept.all():
         return None
-    return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
+    return replace(table, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
 
 
 def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:
     if not np.isfinite(table.columns["y_um"]).any():
         raise DataError(f"{table.name}: no measured Y that may be used")
     columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
-    table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
+    table = replace(table, columns=columns)
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None

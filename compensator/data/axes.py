@@ -110,7 +110,7 @@ def _as_first(one: Measurement, axis: str) -> Measurement:
     columns = {name: values for name, values in one.table.columns.items() if name not in (own, first)}
     if own in one.table.columns:
         columns[first] = one.table.columns[own]
-    return dataclasses.replace(one, table=dataclasses.replace(one.table, columns=columns))
+    return dataclasses.replace(one, table=dataclasses.replace(one.table, columns=columns, zeros_s=()))
 
 
 def _moves(one: Measurement, axis: str) -> bool:

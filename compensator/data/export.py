@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import UNSET
 
 from compensator.atomic_write import atomic_write
 from compensator.axes import FIRST
-from compensator.data.probed import measured_probes, zeros_ns
+from compensator.data.probed import about_one_zero, measured_probes, others_left_out, zeros_ns
 from compensator.data.table import MEASURED_HEAT, QUALITY
 from compensator.errors import DataError, of_files
 from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample, number
@@ -132,8 +133,10 @@ def _add_probes(
     """
     if not any(recorded) or any(row.get("y_um") is not None for row in rows.values()):
         return
-    probes, remarks = measured_probes(name, recorded, zeros)
-    for remark in remarks:
+    of_feature, remarks = measured_probes(name, recorded)
+    kept = about_one_zero(np.array([probe.time_utc_ns for probe in of_feature], dtype=np.int64), zeros)
+    probes = [probe for probe, is_kept in zip(of_feature, kept, strict=True) if is_kept]
+    for remark in (*remarks, *others_left_out(name, len(probes), len(of_feature) - len(probes))):
         log.warning("%s", remark.marked)
     begins = sorted((middle - half, seq) for seq, (middle, half) in middles.items())
     values: defaultdict[int, list[float]] = defaultdict(list)

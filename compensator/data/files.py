@@ -206,7 +206,7 @@ def read_workbook(path: Path, roles: Mapping[str, str]) -> Table:
 def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read recordings that follow each other as one table; each has the columns that the roles name.
 
-    Where no displacement sensor measured Y, the values of touch probes of one level are `y_um`, each in a row of its
+    Where no displacement sensor measured Y, the values of touch probes of one feature are `y_um`, each in a row of its
     own: as much later than the probe as the time of a sample, its end, is than the middle of its polls.
 
     Raises
@@ -225,15 +225,16 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
         name: np.concatenate([table.columns.get(name, np.full(table.t_s.size, np.nan)) for table in tables])
         for name in names
     }
-    remarks: tuple[Remark, ...] = ()
-    if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        zeros = [time_ns for part in parts for time_ns in part.zeros_ns]
-        probes, remarks = measured_probes(str(paths[0]), [part.probes for part in parts], zeros)
-        if probes:
-            t_s, columns = with_probes(t_s, columns, probes, max(part.behind_ns for part in parts))
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
-    return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
+    table = Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+    if np.isfinite(columns.get("y_um", np.array([]))).any():
+        return table, ()
+    probes, remarks = measured_probes(table.name, [part.probes for part in parts])
+    if not probes:
+        return table, remarks
+    zeros = [time_ns for part in parts for time_ns in part.zeros_ns]
+    return with_probes(table, probes, zeros, max(part.behind_ns for part in parts)), remarks
 
 
 class _Recording(NamedTuple):

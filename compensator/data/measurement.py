@@ -19,6 +19,7 @@ from compensator.data.cleaning import cleaned, refuse_at_limit
 from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
+from compensator.data.probed import of_one_zero
 from compensator.data.record import SampledData, SampledRecord, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.screening import check_deformation_scale, check_y_std, screen_temperatures
@@ -112,17 +113,25 @@ class Measurement(display.Shown):
         """Time from the first row to the last, h."""
         return float(np.ptp(self.table.t_s)) / 3600.0
 
-    def at_period(self, period_s: float) -> SampledData:
+    def at_period(self, period_s: float, *, every_zero: bool = False) -> SampledData:
         """Return the records at a sample period, s, with what had to be corrected.
+
+        Parameters
+        ----------
+        period_s : float
+            Sample period, s.
+        every_zero : bool
+            Whether Y that was probed is that about every zero, and not only about that which has most probes.
 
         Raises
         ------
         DataError
             If a value or time cannot have been measured.
         """
-        data = to_grid(self.table, period_s)
+        table, others = (self.table, ()) if every_zero else of_one_zero(self.table)
+        data = to_grid(table, period_s)
         records, left_out = cleaned(self.name, data.records)
-        return SampledData(records=records, remarks=(*self.remarks, *data.remarks, *left_out))
+        return SampledData(records=records, remarks=(*self.remarks, *others, *data.remarks, *left_out))
 
     def before(self, hour: float) -> Measurement:
         """Return the rows before an hour from the start.
@@ -331,6 +340,7 @@ def runs_in(
     *,
     y_std_um: float | None = None,
     check: Callable[[SampledRecord, str], None] = lambda record, name: None,
+    every_zero: bool = False,
 ) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements, and what had to be corrected.
 
@@ -344,6 +354,8 @@ def runs_in(
         Standard deviation of one measured value of Y, µm; by default what neighbouring values show.
     check : callable
         Called with each record and the name of its data; refuses what cannot be used.
+    every_zero : bool
+        Whether Y that was probed is that about every zero (`Run.zeros_s`), and not only about one.
 
     Raises
     ------
@@ -353,7 +365,7 @@ def runs_in(
         If the standard deviation is none.
     """
     check_y_std(y_std_um)
-    gridded = [(measured, measured.at_period(period_s)) for measured in data]
+    gridded = [(measured, measured.at_period(period_s, every_zero=every_zero)) for measured in data]
     runs: list[Run] = []
     remarks: list[Remark] = []
     for number, (measured, part) in enumerate(gridded):
@@ -362,8 +374,10 @@ def runs_in(
             check(record, measured.name)
             require(measured.name, record, _NEEDED)
             refuse_at_limit(measured.name, record)
+            zeros_s = tuple(at_s - float(measured.table.t_s.min()) for at_s in measured.table.zeros_s)
             for run in runs_of(measured.label, record):
-                runs.append(dataclasses.replace(run, recording=number, y_std_um=y_std_um))
+                own = dataclasses.replace(run, recording=number, y_std_um=y_std_um)
+                runs.append(own.with_zeros(zeros_s) if every_zero else own)
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
     return runs, remarks
@@ -375,6 +389,7 @@ def screened_runs_in(
     *,
     y_std_um: float | None = None,
     check: Callable[[SampledRecord, str], None] = lambda record, name: None,
+    every_zero: bool = False,
 ) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements that a model is judged by, as `runs_in`, with temperatures and Y screened.
 
@@ -383,7 +398,7 @@ def screened_runs_in(
     DataError
         If a temperature cannot be true, or Y moves by no or another unit's amount.
     """
-    runs, remarks = runs_in(data, period_s, y_std_um=y_std_um, check=check)
+    runs, remarks = runs_in(data, period_s, y_std_um=y_std_um, check=check, every_zero=every_zero)
     name = name_of(runs)
     screen_temperatures(name, runs, quiet_air=True)
     check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))

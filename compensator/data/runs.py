@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Mask, Vector
+from compensator.arrays import Indices, Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
 
 #: Longest stretch at the start of a run whose mean is its reference, samples.
@@ -48,6 +48,8 @@ class Run:
         Standard deviation of one measured value of the deformation as it was stated, µm.
     row_s : float
         Usual time between the rows that the samples are made from, s; NaN where it is not known.
+    zeros_s : tuple of float
+        Where Y was probed: times within it from which on Y counts from another zero, s, each with values on both sides.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Run:
     recording: int = 0
     y_std_um: float | None = None
     row_s: float = math.nan
+    zeros_s: tuple[float, ...] = ()
 
     @property
     def has_sparse_y(self) -> bool:
@@ -79,6 +82,27 @@ class Run:
         at, covered = np.flatnonzero(mask), np.zeros(mask.size, dtype=bool)
         covered[at[0] : at[-1] + 1] = True
         return covered
+
+    def with_zeros(self, zeros_s: Sequence[float]) -> Run:
+        """Return the run with the times from which on Y counts from another zero, s.
+
+        Left out are values that show nothing: those of a sample that a zero may divide, whose zero is not known, and a
+        single one about a zero.
+        """
+        if not zeros_s:
+            return self
+        zeros, period_s = np.sort(zeros_s), float(self.t_s[1] - self.t_s[0])
+        own = self.without_y(np.any(np.abs(self.t_s - zeros[:, None]) < period_s, axis=0))
+        numbers = np.searchsorted(zeros, own.t_s)
+        counts = np.bincount(numbers[np.isfinite(own.y_um)], minlength=zeros.size + 1)
+        own = own.without_y(counts[numbers] == 1)
+        # Of zeros without values between them the last one is enough.
+        return dataclasses.replace(own, zeros_s=tuple(zeros[np.flatnonzero(counts > 1)[1:] - 1].tolist()))
+
+    @property
+    def zero_numbers(self) -> Indices:
+        """Number of the zero that Y of each sample counts from, from 0, shape (n,)."""
+        return np.searchsorted(self.zeros_s, self.t_s)
 
     def without_y(self, mask: Mask) -> Run:
         """Return the run without some values of Y."""

@@ -102,6 +102,8 @@ class Table:
         Time of the first row, s since 1970, where the table has `time_utc`.
     remarks : tuple of Remark
         What was left out when it was read.
+    zeros_s : tuple of float
+        Where Y was probed: times from which on it may count from another zero, in the clock of `t_s`.
     """
 
     name: str
@@ -110,6 +112,7 @@ class Table:
     rows: Sequence[int]
     start_utc_s: float | None = None
     remarks: tuple[Remark, ...] = ()
+    zeros_s: tuple[float, ...] = ()
 
     def with_roles(self, roles: Mapping[str, str]) -> Table:
         """Return the table with columns renamed to their roles; `table_of` has renamed the time.

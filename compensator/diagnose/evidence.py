@@ -32,7 +32,7 @@ from compensator.diagnose.base_run import (
 )
 from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error_um
-from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
+from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, decays_of, freedom_of, zeros_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Context, Place
@@ -63,8 +63,10 @@ class Evidence:
         Of all runs, one after another, µm; 0 where it is not used.
     used : numpy.ndarray of bool, shape (n,)
         Samples that take part.
-    nuisances : numpy.ndarray, shape (n, k)
-        A constant and decays of all times that the base may have, of each run, on every sample.
+    zeros : numpy.ndarray, shape (n, z)
+        A column for each zero that Y counts from, 1 on its samples: each run has one, or several where Y was probed.
+    decays : numpy.ndarray, shape (n, k)
+        Decays of all times that the base may have, of each run, on every sample.
     basis : numpy.ndarray, shape (n, m)
         Orthonormal columns that the nuisances span on the samples used.
     context : Context
@@ -86,7 +88,8 @@ class Evidence:
     signals: tuple[RecordSignals, ...]
     residual: Vector
     used: Mask
-    nuisances: Matrix
+    zeros: Matrix
+    decays: Matrix
     basis: Matrix
     context: Context
     noise: NoiseTest
@@ -189,7 +192,7 @@ class Evidence:
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
-        basis = basis_of(self.nuisances, used)
+        basis = basis_of(np.concatenate([self.zeros, self.decays], axis=1), used)
         freedom = freedom_of(used, basis) if self.is_sparse else 0
         return dataclasses.replace(
             self,
@@ -234,10 +237,10 @@ class Evidence:
         added : numpy.ndarray, shape (n,)
             What effects add to Y, µm.
         at_rest : bool
-            Whether only the zero of each run is unknown, and not its initial state.
+            Whether only the zeros are unknown, and not the initial states.
         """
         open_ = self.residual - added
-        table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
+        table = self.zeros if at_rest else np.concatenate([self.zeros, self.decays], axis=1)
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         return np.asarray(open_ - table @ coefficients)
 
@@ -261,11 +264,11 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     begins = beginnings(runs)
     signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
     signals = with_warmths(model, runs, signals)
-    parts = [
-        run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run)
-        for run, own in zip(courses, signals, strict=True)
+    predicted = [
+        own.y_dtf_um + own.y_tdtf_um + effects_of(model, run) for run, own in zip(courses, signals, strict=True)
     ]
-    residual = np.concatenate(parts)
+    runs = [_levelled(run, by_model) for run, by_model in zip(runs, predicted, strict=True)]
+    residual = np.concatenate([run.y_um - by_model for run, by_model in zip(runs, predicted, strict=True)])
     used = np.isfinite(residual)
     names = ", ".join(dict.fromkeys(run.name for run in runs))
     # A part in which Y was never measured says nothing of how it is measured.
@@ -280,8 +283,9 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     apart = no_causes(names, runs)
     context = context_of(model, signals, apart)
-    nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
-    basis = basis_of(nuisances, used)
+    zeros = np.asarray(block_diag(*(zeros_of(run.zero_numbers) for run in runs)))
+    decays = np.asarray(block_diag(*(decays_of(record, context) for record in signals)))
+    basis = basis_of(np.concatenate([zeros, decays], axis=1), used)
     # The noise of a value that was measured now and then is none of the calibration's.
     own_um = own_error_um(model, 0.0 if sparse else noise_um, spread_um)
     count, freedom = int(used.sum()), freedom_of(used, basis) if sparse else 0
@@ -291,10 +295,24 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         signals=tuple(signals),
         residual=np.where(used, residual, 0.0),
         used=used,
-        nuisances=nuisances,
+        zeros=zeros,
+        decays=decays,
         basis=basis,
         context=context,
         noise=NoiseTest(count=count, noise_um=noise_um, own_error_um=own_um, freedom=freedom),
         probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
         no_causes=apart,
     )
+
+
+def _levelled(run: Run, predicted: Vector) -> Run:
+    """Return a run without the steps of Y at its zeros: they are set so that the model errs by one mean about each.
+
+    How large they are is not known, and what is found does not depend on it: each zero is free.
+    """
+    if not run.zeros_s:
+        return run
+    numbers, error, y_um = run.zero_numbers, run.y_um - predicted, run.y_um.copy()
+    for number in range(1, len(run.zeros_s) + 1):
+        y_um[numbers == number] -= np.nanmean(error[numbers == number]) - np.nanmean(error[numbers == 0])
+    return dataclasses.replace(run, y_um=y_um)

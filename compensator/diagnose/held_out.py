@@ -104,18 +104,17 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
 
 
 def left_of_block(evidence: Evidence, block: Mask, knows_zero: Sequence[bool], predicted: Vector) -> Vector:
-    """Return what a prediction leaves of a block, µm; a run whose zero it does not know is about its own mean."""
+    """Return what a prediction leaves of a block, µm; what is about a zero that it does not know about its own mean."""
     left = np.where(block, evidence.residual - predicted, np.nan)
-    for run, is_known in zip(evidence.samples_of_runs(), knows_zero, strict=True):
-        if block[run].any() and not is_known:
-            left[run] -= np.nanmean(left[run])
+    for own, is_known in zip(evidence.zeros.T > 0.0, knows_zero, strict=True):
+        if (block & own).any() and not is_known:
+            left[own] -= np.nanmean(left[own])
     return np.asarray(left[block])
 
 
 def zeros_known(points: Points) -> tuple[bool, ...]:
-    """Return for each run whether a point shows its zero; a few samples at its end are none."""
-    first, runs = points.first, points.evidence.samples_of_runs()
-    return tuple(bool(np.any((first >= run.start) & (first < run.stop))) for run in runs)
+    """Return for each zero whether a point shows it; a few samples at the end of a run are none."""
+    return tuple(np.any(points.evidence.zeros[points.first] > 0.0, axis=0).tolist())
 
 
 #: With the rest of a search without effects, and with that beside them.
@@ -134,7 +133,7 @@ class _Predictions:
         base's paths as they are, and nothing, with each rest; with the rest beside effects also the named effects,
         effects and remainder, and all channels. By each place what its effect and those of the places before it add.
     knows_zero : tuple of bool
-        For each run whether it knows its zero.
+        For each zero whether it knows it.
     has : numpy.ndarray of int, shape (places,)
         1 where it found an effect of that place.
     """

@@ -26,7 +26,7 @@ def with_initial_state(fit: Fit) -> Evidence | None:
     if not any(term.effect.counts_from_rest and term.effect.path == "DTF" for term in fit.terms):
         return None
     weights = fit.likelihood.weights(fit.added)[points.zeros.shape[1] :][: points.starts_of_modes.shape[1]]
-    initial_um = evidence.nuisances[:, ~points.is_zero] @ (rest.start_um * weights)
+    initial_um = evidence.decays @ (rest.start_um * weights)
     if np.max(np.abs(initial_um)) <= WARM_SHARE * evidence.context.sizes_um["DTF"]:
         return None
     return evidence.with_initial_state(initial_um)

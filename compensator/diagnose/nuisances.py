@@ -1,4 +1,4 @@
-"""What every record has and no effect causes: its zero, and the unknown initial state of the base model."""
+"""What every record has and no effect causes: its zero, or each of its zeros, and the base model's initial state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from compensator.arrays import Mask, Matrix
+from compensator.arrays import Indices, Mask, Matrix
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 
@@ -16,12 +16,17 @@ STATE_PRIOR = 1e-3
 FASTEST, DECAY_RATIO = 2.0, 3.5
 
 
-def nuisances_of(record: RecordSignals, context: Context) -> Matrix:
-    """Return a constant and decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
+def zeros_of(numbers: Indices) -> Matrix:
+    """Return a column for each zero that Y of a record counts from, 1 where it does; see `Run.zero_numbers`."""
+    return np.asarray(numbers[:, None] == np.unique(numbers), dtype=np.float64)
+
+
+def decays_of(record: RecordSignals, context: Context) -> Matrix:
+    """Return decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
     fastest = FASTEST * record.period_min
     slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])
     taus = np.geomspace(fastest, slowest, 1 + math.ceil(math.log(slowest / fastest, DECAY_RATIO))).tolist()
-    return np.column_stack([np.ones(record.size), *(np.exp(-record.minutes / tau) for tau in taus)])
+    return np.column_stack([np.exp(-record.minutes / tau) for tau in taus])
 
 
 def basis_of(nuisances: Matrix, used: Mask) -> Matrix:

@@ -120,8 +120,6 @@ class Points:
         Standard deviation of the deformation, and the own error of the base's paths, µm.
     typical_logs : numpy.ndarray, shape (5,)
         `Rest.logs` as it is expected before the data are seen.
-    is_zero : numpy.ndarray of bool
-        Which columns of the nuisances are zeros of runs.
     zeros, starts_of_modes, fast, slow : numpy.ndarray, shape (points, ·)
         Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
     """
@@ -155,10 +153,8 @@ class Points:
         self.fast, self.slow, self._by_paths = self._own_columns()
         self._forms: dict[str, tuple[Matrix, Matrix]] = {}
         self._known: dict[tuple[Hypothesis, tuple[float, ...]], Matrix] = {}
-        nuisances = self.averaged(evidence.nuisances)
-        self.is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
-        self.zeros = ZERO_TIMES * self.spread_um * nuisances[:, self.is_zero]
-        self.starts_of_modes = nuisances[:, ~self.is_zero]
+        self.zeros = ZERO_TIMES * self.spread_um * self.averaged(evidence.zeros)
+        self.starts_of_modes = self.averaged(evidence.decays)
 
     def of(self, evidence: Evidence, *, foretells: bool | None = None) -> Points:
         """Return the points of other evidence, or those of it that foretell."""
@@ -252,8 +248,8 @@ class Points:
 
     def zeros_and_starts(self, rest: Rest) -> Matrix:
         """Return the first columns of `random`, zeros and initial states, on every sample."""
-        table, zero_um = self.evidence.nuisances, ZERO_TIMES * self.spread_um
-        return np.concatenate([zero_um * table[:, self.is_zero], rest.start_um * table[:, ~self.is_zero]], axis=1)
+        zeros_um = ZERO_TIMES * self.spread_um * self.evidence.zeros
+        return np.concatenate([zeros_um, rest.start_um * self.evidence.decays], axis=1)
 
     def random(self, rest: Rest) -> Matrix:
         """Return columns whose weights are unknown with standard deviation 1.

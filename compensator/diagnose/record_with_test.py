@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term
-from compensator.diagnose.nuisances import nuisances_of
+from compensator.diagnose.nuisances import decays_of
 from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.diagnose.trials import Trial
 from compensator.diagnose.whitening import Whitening
@@ -51,13 +51,13 @@ class RecordWithTest:
         if every_min:
             samples = max(1, round(every_min / evidence.context.period_min))
         measured = (np.arange(n) + 1) % samples == 0
-        rest = nuisances_of(trial.signals, evidence.context)
         self.evidence = dataclasses.replace(
             evidence,
             signals=(*evidence.signals, trial.signals),
             residual=np.concatenate([evidence.residual, np.zeros(n)]),
             used=np.concatenate([evidence.used, measured]),
-            nuisances=np.asarray(block_diag(evidence.nuisances, rest)),
+            zeros=np.asarray(block_diag(evidence.zeros, np.ones((n, 1)))),
+            decays=np.asarray(block_diag(evidence.decays, decays_of(trial.signals, evidence.context))),
             noise=dataclasses.replace(evidence.noise, count=evidence.count + int(measured.sum())),
         )
         self.points = Points(self.evidence)

@@ -74,7 +74,7 @@ async def test_only_one_feature_is_used_and_said_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("zero_at", [130, 310])
-async def test_probes_about_the_zero_with_most_are_used_as_in_the_loop(tmp_path: Path, caplog, zero_at: int) -> None:
+async def test_probes_about_each_zero_are_told_apart_as_in_the_loop(tmp_path: Path, caplog, zero_at: int) -> None:
     machine = ProbedMachine(tmp_path, noise_um=0.0, config=WIDE)
     machine.each_hour(400, every=30)
     machine.at_sample[zero_at] = lambda: machine.command("zero", b'{"mode": "warm"}')
@@ -88,14 +88,21 @@ async def test_probes_about_the_zero_with_most_are_used_as_in_the_loop(tmp_path:
     assert len(taken) > len(level) >= 8
     found = read(machine)
     known = np.isfinite(found.table.columns["y_um"])
-    assert found.table.columns["y_um"][known].tolist() == [probe.deformation_um for probe in level]
-    (remark,) = found.remarks
-    assert remark.code == "zeros_left_out"
-    assert f"{len(level)} probe(s); {len(taken) - len(level)} about others left out" in remark
+    assert found.table.columns["y_um"][known].tolist() == [probe.deformation_um for probe in taken]
     loop = usable_table(machine.outcomes)
     measured = np.isfinite(loop.columns["y_um"])
     assert found.table.t_s[known].tolist() == loop.t_s[measured].tolist()
     assert found.table.columns["y_um"][known].tolist() == loop.columns["y_um"][measured].tolist()
+    assert found.table.zeros_s == loop.zeros_s and len(loop.zeros_s) == 2
+    data = found.at_period(60.0)
+    (record,) = data.records
+    assert np.isfinite(record.columns["y_um"]).sum() == len(level)
+    (remark,) = (remark for remark in data.remarks if remark.code == "zeros_left_out")
+    assert f"{len(level)} probe(s); {len(taken) - len(level)} about others left out" in remark
+    (run,), remarks = runs_in([found], every_zero=True)
+    assert "zeros_left_out" not in [remark.code for remark in remarks]
+    numbers = run.zero_numbers[np.isfinite(run.y_um)].tolist()
+    assert numbers == [int(probe.time_utc_ns > zero_ns) for probe in taken]
     tc.export(recordings(machine.recordings, MACHINE), tmp_path / "all.csv")
     assert "zeros_left_out" in caplog.text
     with (tmp_path / "all.csv").open() as file:
@@ -125,11 +132,8 @@ async def test_a_table_of_each_zero_keeps_all_probes(tmp_path: Path) -> None:
     runs, _ = runs_in(measurements(tables, "data"))
     taken = sum(probe.taken for probe in machine.recorded())
     assert [run.recording for run in runs] == [0, 1]
-    assert (
-        sum(np.isfinite(run.y_um).sum() for run in runs)
-        == taken
-        > np.isfinite(read(machine).table.columns["y_um"]).sum()
-    )
+    (together,), _ = runs_in([read(machine)])
+    assert sum(np.isfinite(run.y_um).sum() for run in runs) == taken > np.isfinite(together.y_um).sum()
 
 
 async def test_an_exported_table_has_the_probes_of_the_recording(tmp_path: Path, caplog) -> None:

@@ -94,6 +94,54 @@ def test_a_gain_is_named_from_47_hourly_probes(gain):
     assert gain.model.effects  # deployed: blocks of 16 values do not contradict by chance
 
 
+def zeroed(columns, shifts_um, every_h):
+    """The same data where a zero was set each so many hours, and Y counts anew from each."""
+    minutes = np.arange(columns["y_um"].size)
+    at_s = tuple(3600.0 * every_h * (i + 1) + 20.0 for i in range(len(shifts_um) - 1))
+    shifted = columns["y_um"] + np.array(shifts_um)[np.searchsorted(at_s, 60.0 * minutes)]
+    found = tc.read(columns | {"y_um": shifted})
+    return dataclasses.replace(found, table=dataclasses.replace(found.table, zeros_s=at_s))
+
+
+def test_a_zero_each_shift_leaves_a_diagnosis_all_probes():
+    """Eight probes about each zero: too few about one of them, and a step at each that the machine did not make."""
+    columns = probed("gain DTF", 1)
+    data = zeroed(columns, [0.0, 20.0, -35.0, 12.0, -8.0, 30.0], 8.0)
+    found, plain = tc.diagnose("quill", data, y_std_um=STD_UM), tc.diagnose("quill", columns, y_std_um=STD_UM)
+    assert [(effect.kind, effect.path) for effect in found.effects] == [("gain", "DTF")]
+    assert found.verdict == "explained"
+    (own,), (other,) = (one.diagnosis.effects for one in (found, plain))
+    assert own.effect.change == pytest.approx(other.effect.change, abs=0.05)
+    assert [remark.code for remark in found.remarks] == ["several_zeros"]
+    assert "about 6 zeros" in found.remarks[0]
+    # The curve of the page has none of the steps.
+    assert np.nanmax(np.abs(found.diagnosis.residual_before)) < 20.0
+    with pytest.raises(DataError, match=r"y_um has [78] values, expected at least 12"):
+        tc.diagnose("quill", columns | {"y_um": np.where(np.arange(2880) < 480, columns["y_um"], np.nan)}, y_std_um=1.5)
+
+
+def test_a_value_shows_nothing_where_its_zero_does_not_show():
+    (run,) = runs(probed("none", 1, hours=10.0))
+    y, at = np.full(run.t_s.size, np.nan), [60, 120, 180, 240, 300, 301, 360, 420]
+    y[at] = 1.0
+    run = dataclasses.replace(run, y_um=y)
+    # One value about the second zero, none about the third, a sample that the last zero divides.
+    zeroed_run = run.with_zeros([60.0 * 301 + 10.0, 60.0 * 200, 60.0 * 250, 60.0 * 260])
+    assert np.flatnonzero(np.isfinite(zeroed_run.y_um)).tolist() == [60, 120, 180, 360, 420]
+    assert zeroed_run.zero_numbers[[60, 180, 360, 420]].tolist() == [0, 0, 1, 1]
+    assert run.with_zeros([]) is run
+
+
+def test_what_is_about_a_zero_that_was_held_out_is_about_its_own_mean():
+    (run,) = runs(probed("none", 1, hours=20.0))
+    evidence = evidence_of(QUILL, [run.with_zeros([36000.0])])
+    late = evidence.used & (run.t_s > 36000.0)
+    known = held_out.zeros_known(Points(evidence.without(late)))
+    assert known == (True, False)
+    left = held_out.left_of_block(evidence, late, known, np.full(run.t_s.size, 7.0))
+    assert abs(left.mean()) < 1e-9 and left.std() > 0.5
+
+
 def test_a_part_without_a_probe_keeps_no_gain_from_being_named():
     """A shift in which nobody probed: 29 probes are in the other part, fewer than samples would be wanted."""
     columns = probed("gain DTF", 1)

@@ -5,7 +5,7 @@ in which the fault was there already. Temperatures and other channels stay as th
 throughout. Only where T_Q, AT or Y stood still for an hour, as no live sensor does, are they left out, or each
 diagnosis of that record would be refused.
 
-Where Y is probed, the values of one level are used, as of any recording (`data.probed`).
+Where Y is probed, the values of one feature are used, as of any recording (`data.probed`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
-from compensator.data.probed import of_one_level, with_probes
+from compensator.data.probed import of_one_feature, with_probes
 from compensator.data.screening import dead_part
 from compensator.data.table import Table
 from compensator.errors import DataError
@@ -85,11 +85,12 @@ def table_of_rows(
     columns["y_um"] = y
     for channel in _ALIVE:
         columns[channel] = _alive(columns[channel])
-    if not np.isfinite(columns["y_um"]).any():
-        # A sample in which the service began has fewer polls.
-        behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
-        t_s, columns = with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns), behind_ns)
-    return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+    table = Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+    if np.isfinite(columns["y_um"]).any():
+        return table
+    # A sample in which the service began has fewer polls.
+    behind_ns = max((sample.behind_ns for sample, _ in rows), default=0)
+    return with_probes(table, _usable(probes, left_out, rows), zeros_ns, behind_ns)
 
 
 def _alive(values: Vector) -> Vector:
@@ -116,14 +117,12 @@ def _left_out_s(rows: Sequence[tuple[Sample, Offset | None]]) -> Vector:
     return times[left_out]
 
 
-def _usable(
-    probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]], zeros_ns: Sequence[int]
-) -> list[Probe]:
-    """Return the taken probes of one level outside of what is left out."""
+def _usable(probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]]) -> list[Probe]:
+    """Return the taken probes of one feature outside of what is left out."""
     period_s = rows[0][0].period_s if rows else 0.0
 
     def is_left_out(at_s: float) -> bool:
         return bool(np.any((left_out - period_s <= at_s) & (at_s <= left_out)))
 
     usable = [probe for probe in probes if probe.taken and not is_left_out(probe.time_utc_ns / NS)]
-    return of_one_level(usable, zeros_ns)
+    return of_one_feature(usable)
