@@ -625,6 +625,11 @@ class DataRemark(Code):
         "A column has no value in any row.",
         "Check the sensor and the logger, or leave the column out.",
     )
+    COLUMN_MISSING = (
+        "column_missing",
+        "A column has no value for longer than may be interpolated, so nothing is looked for in it.",
+        "Diagnose the rows that have it: those since the sensor was added, or those before it failed.",
+    )
     COLUMN_COPY = (
         "column_copy",
         "A channel has the values of another one in every row; only the first of them is searched.",

@@ -18,6 +18,8 @@ REST_SAMPLES = 30
 NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30
+#: A gap of T_Q or AT by so many samples longer than usual leaves the heat in it unknown.
+HOLE_SAMPLES = 5
 #: Four values that follow each other within so many samples are neighbours: they show the noise of a slow signal.
 NEIGHBOURS_SAMPLES = 12
 
@@ -41,7 +43,7 @@ class Run:
     reference : tuple of float
         T_Q and AT that the changes count from, °C.
     channels : dict of str to numpy.ndarray, shape (n,)
-        Every other column, gaps bridged.
+        Every other column; gaps of up to `SHORT_GAP_SAMPLES` bridged, NaN in longer ones.
     recording : int
         Which of several recordings it is a part of.
     y_std_um : float, optional
@@ -50,6 +52,9 @@ class Run:
         Usual time between the rows that the samples are made from, s; NaN where it is not known.
     zeros_s : tuple of float
         Where Y was probed: times within it from which on Y counts from another zero, s, each with values on both sides.
+    holes : tuple of (int, int)
+        First sample and end of each gap of T_Q or AT that was bridged and is longer than usual by more than
+        `HOLE_SAMPLES`: how the machine was heated in it is not known.
     """
 
     name: str
@@ -64,6 +69,12 @@ class Run:
     y_std_um: float | None = None
     row_s: float = math.nan
     zeros_s: tuple[float, ...] = ()
+    holes: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def period_s(self) -> float:
+        """Time between two samples, s."""
+        return float(self.t_s[1] - self.t_s[0])
 
     @property
     def has_sparse_y(self) -> bool:
@@ -91,8 +102,8 @@ class Run:
         """
         if not zeros_s:
             return self
-        zeros, period_s = np.sort(zeros_s), float(self.t_s[1] - self.t_s[0])
-        own = self.without_y(np.any(np.abs(self.t_s - zeros[:, None]) < period_s, axis=0))
+        zeros = np.sort(zeros_s)
+        own = self.without_y(np.any(np.abs(self.t_s - zeros[:, None]) < self.period_s, axis=0))
         numbers = np.searchsorted(zeros, own.t_s)
         counts = np.bincount(numbers[np.isfinite(own.y_um)], minlength=zeros.size + 1)
         own = own.without_y(counts[numbers] == 1)
@@ -137,7 +148,9 @@ def runs_of(name: str, record: SampledRecord) -> Iterator[Run]:
         part = {c: v[first:last] for c, v in columns.items()}
         bridged = {c: v if c == "y_um" else _bridged(v) for c, v in part.items()}
         label = name if len(parts) == 1 else f"{name} part {i}"
-        yield dataclasses.replace(_run(label, record.t_s[first:last], bridged), row_s=record.row_s)
+        run = _run(label, record.t_s[first:last], bridged)
+        holes = [hole for column in ("t_q_degc", "at_degc") for hole in _holes(np.isnan(part[column]))]
+        yield dataclasses.replace(run, row_s=record.row_s, holes=tuple(sorted(set(holes))))
 
 
 def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
@@ -183,15 +196,30 @@ def _stretches(missing: Mask) -> Iterator[tuple[int, int]]:
             yield int(group[0]), int(group[-1]) + 1
 
 
+def _holes(missing: Mask) -> Iterator[tuple[int, int]]:
+    """Yield first sample and end of the gaps that are longer than the usual distance of two values; see `Run.holes`."""
+    present = np.flatnonzero(~missing)
+    apart = np.diff(present)
+    for i in np.flatnonzero(apart > np.median(apart) + HOLE_SAMPLES):
+        yield int(present[i]) + 1, int(present[i + 1])
+
+
 def _bridged(values: Vector) -> Vector:
+    """Return values without short gaps; what a longer one hides is not known."""
     known = np.flatnonzero(~np.isnan(values))
     if known.size in (0, values.size):
         return values
-    return np.interp(np.arange(values.size), known, values[known])
+    at = np.arange(values.size)
+    bridged = np.interp(at, known, values[known])
+    before, after = (np.searchsorted(known, at, side=side) for side in ("right", "left"))
+    ends = np.concatenate([[-1], known, [values.size]])
+    # From the value before a sample, or the begin, to the value after it, or the end.
+    bridged[ends[after + 1] - ends[before] > SHORT_GAP_SAMPLES + 1] = np.nan
+    return bridged
 
 
-def noise_std(values: Vector) -> float:
-    """Return the standard deviation of white noise on a slow signal, by third differences.
+def noise_std(*parts: Vector) -> float:
+    """Return the standard deviation of white noise on a slow signal, by third differences within its parts.
 
     The median is insensitive to steps and outliers. A signal in converter steps has many differences of zero; the mean
     square of the lower nine tenths is used then.
@@ -202,10 +230,11 @@ def noise_std(values: Vector) -> float:
     >>> round(noise_std(slow + np.random.default_rng(0).normal(0.0, 0.3, 5000)), 1)
     0.3
     """
-    v = values[~np.isnan(values)]
-    if v.size < 8:
+    known = [values[~np.isnan(values)] for values in parts]
+    differences = np.concatenate([np.diff(v, 3) for v in known])
+    if differences.size < 5:
         return 0.0
-    size = np.sort(np.abs(np.diff(v, 3))) / np.sqrt(20.0)
+    size = np.sort(np.abs(differences)) / np.sqrt(20.0)
     typical = float(np.median(size)) / 0.6745
     lower = size[: max(1, int(0.9 * size.size))]
     # The mean square over the lower nine tenths of a normal's magnitudes is 0.6107 of its variance.
@@ -235,9 +264,21 @@ def is_noise(values: Vector, noise: float | None = None) -> bool:
 
 
 def noise_of(runs: Sequence[Run]) -> dict[str, float]:
-    """Return the noise of `t_q_degc`, `at_degc` and `y_um`, in their units: the largest of all runs."""
-    temperatures = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc")}
-    return temperatures | {"y_um": max(run.y_noise_um for run in runs)}
+    """Return the noise of `t_q_degc`, `at_degc` and `y_um`, in their units: the largest of all recordings.
+
+    The runs of a recording with many gaps are short, and the noise of the least lucky one is larger than that of all.
+    """
+    by_recording: dict[int, list[Run]] = {}
+    for run in runs:
+        by_recording.setdefault(run.recording, []).append(run)
+
+    def largest(name: str) -> float:
+        return max(noise_std(*(getattr(run, name) for run in parts)) for parts in by_recording.values())
+
+    found = {name: largest(name) for name in ("t_q_degc", "at_degc", "y_um")}
+    if stated := [run.y_std_um for run in runs if run.y_std_um is not None]:
+        found["y_um"] = max(stated)
+    return found
 
 
 def walk_std(values: Sequence[Vector], noise: float) -> float:

@@ -13,6 +13,7 @@ from compensator.data.runs import Run, noise_std
 from compensator.diagnose.no_causes import DISPLACEMENT
 from compensator.diagnose.noise import drive_of
 from compensator.diagnose.smoothing import course
+from compensator.model.effects.base import filters
 from compensator.model.effects.hypothesis import COOLEST, DEGC, EQUAL, Context
 from compensator.model.effects.signals import COLD, RecordSignals, Warmth
 from compensator.model.engine import Engine
@@ -110,6 +111,21 @@ def effects_of(model: ThermalModel, run: Run) -> Vector:
     engine = Engine(model)
     engine.set_reference(*run.reference)
     return np.array([sum(e.y_effects_um) for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
+
+
+def warm_effects_of(model: ThermalModel, record: RecordSignals, rest: str) -> Vector:
+    """Return what the effects that a model has already add besides, µm, as the record begins if it is at rest there.
+
+    An effect that is not linear in a path is another one around another point, as for new ones (`Hypothesis.columns`).
+    """
+    added, warm = np.zeros(record.size), record.begun(rest)
+    if warm.begins_at_rest:
+        return added
+    for effect in model.effects:
+        if effect.counts_from_rest and effect.path == "DTF":
+            run = [effect.law(each, filters(effect.blocks(each.period_min))) for each in (warm, warm.held(), record)]
+            added = added + run[0] - run[1] - run[2]
+    return added
 
 
 def late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordSignals]) -> float:

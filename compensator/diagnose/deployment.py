@@ -245,12 +245,12 @@ def _too_short_h(found: Findings, effects: Sequence[FoundEffect], held_out: Held
     """Return the length of a record, h, that is too short for what would be deployed; None if it is not.
 
     In the few hours of one warm-up the own error of an approximate model looks like a missing effect, on held-out
-    blocks, too, and paths are not known from it. Names that leave noise are those of what acts; what held-out blocks
-    confirm, with no parameter smaller than its error, is near enough to it.
+    blocks, too, and so does noise where forms are exact; paths are not known from it. Names that leave noise are those
+    of what acts; what held-out blocks confirm, with no parameter smaller than its error, is near enough to it.
     """
     evidence, hours = found.search.evidence, _hours(found)
     deploys = found.remainder is not None or any(effect.deployable for effect in effects)
-    if hours >= SHORT_H or not deploys or evidence.is_sparse or not evidence.context.approximate:
+    if hours >= SHORT_H or not deploys or evidence.is_sparse:
         return None
     if not (found.terms and found.deploys_names) or evidence.free_paths:
         return hours

@@ -19,22 +19,18 @@ from compensator.data.runs import Run
 from compensator.diagnose.advice import Advice, advice_of
 from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.chips import without_chips
-from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.extended_model import extended_model
 from compensator.diagnose.findings import Findings, findings_of
-from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
-from compensator.diagnose.initial_state import with_initial_state
-from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.named_effects import named_effects, ranked
 from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict
-from compensator.diagnose.points import Points
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.verdict import ceiling_of, judged
 from compensator.diagnose.warning_words import warnings_on
@@ -179,7 +175,7 @@ def _searched(
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
         found, left_out = without_chips(found, evidence_of_runs)
-    found = _as_begun(found)
+    found = as_begun(found, findings_of)
     evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
     effects = named_effects(found, deciding)
@@ -258,16 +254,6 @@ def _refused(chosen: Deployment) -> Refused | None:
 def _of_no_model(effects: Sequence[FoundEffect]) -> list[str]:
     """Return the kinds of effects that no model can have, and in whose place no remainder stands."""
     return sorted({effect.kind for effect in effects if not effect.effect.deployable and not effect.replaced})
-
-
-def _as_begun(found: Findings) -> Findings:
-    """Search once more with the initial state that the named effects need, where they explain more with it."""
-    fit, score = found.selection.fit, found.search.criterion.score
-    evidence = with_initial_state(fit)
-    if evidence is None or score(fit_terms(Likelihood(Points(evidence), fit.rest), fit.starts())) < score(fit) + MARGIN:
-        return found
-    again = findings_of(evidence)
-    return again if score(again.selection.fit) > score(fit) else found
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:

@@ -27,15 +27,16 @@ from compensator.diagnose.base_run import (
     effects_of,
     late_error_um,
     signals_of,
+    warm_effects_of,
     with_warmths,
     without_noise,
 )
 from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error_um
-from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, decays_of, freedom_of, zeros_of
+from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, decays_of, freedom_of, in_holes, zeros_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Context, Place
+from compensator.model.effects.hypothesis import COOLEST, EQUAL, Context, Place
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.thermal_model import ThermalModel
 
@@ -66,11 +67,13 @@ class Evidence:
     zeros : numpy.ndarray, shape (n, z)
         A column for each zero that Y counts from, 1 on its samples: each run has one, or several where Y was probed.
     decays : numpy.ndarray, shape (n, k)
-        Decays of all times that the base may have, of each run, on every sample.
+        Decays of all times that the base may have, from the begin of each run and after holes, on every sample.
     basis : numpy.ndarray, shape (n, m)
         Orthonormal columns that the nuisances span on the samples used.
     context : Context
         What proposals may build on.
+    at_rest : str
+        Where the machine is at rest, for the effects that the model has already (`Hypothesis.rest`).
     noise : NoiseTest
         What noise and the base model's own error may leave of the samples used.
     probe_um : float
@@ -92,6 +95,7 @@ class Evidence:
     decays: Matrix
     basis: Matrix
     context: Context
+    at_rest: str
     noise: NoiseTest
     probe_um: float
     no_causes: Mapping[str, Remark]
@@ -206,9 +210,14 @@ class Evidence:
         """Return the evidence for a base that is far off, whose paths are estimated with everything else."""
         return dataclasses.replace(self, residual=self.deformation_um, free_paths=True)
 
-    def with_initial_state(self, initial_um: Vector) -> Evidence:
-        """Return the evidence with what the initial state of the paths adds on every sample, µm."""
-        parts = [initial_um[run] for run in self.samples_of_runs()]
+    @property
+    def has_initial_state(self) -> bool:
+        """Whether it is known what the initial state of the paths adds."""
+        return any(own.initial_um is not None for own in self.signals)
+
+    def with_initial_state(self, initial_um: Vector | None) -> Evidence:
+        """Return the evidence with what the initial state of the paths adds on every sample, µm; None: not known."""
+        parts = [None if initial_um is None else initial_um[run] for run in self.samples_of_runs()]
         signals = [dataclasses.replace(own, initial_um=part) for own, part in zip(self.signals, parts, strict=True)]
         return dataclasses.replace(self, signals=tuple(signals))
 
@@ -264,12 +273,8 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     begins = beginnings(runs)
     signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
     signals = with_warmths(model, runs, signals)
-    predicted = [
-        own.y_dtf_um + own.y_tdtf_um + effects_of(model, run) for run, own in zip(courses, signals, strict=True)
-    ]
-    runs = [_levelled(run, by_model) for run, by_model in zip(runs, predicted, strict=True)]
-    residual = np.concatenate([run.y_um - by_model for run, by_model in zip(runs, predicted, strict=True)])
-    used = np.isfinite(residual)
+    cold = [effects_of(model, run) for run in courses]
+    used = np.concatenate([np.isfinite(run.y_um) & ~in_holes(run) for run in runs])
     names = ", ".join(dict.fromkeys(run.name for run in runs))
     # A part in which Y was never measured says nothing of how it is measured.
     sparse = all(run.has_sparse_y for run in runs if np.isfinite(run.y_um).any())
@@ -279,13 +284,30 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         raise DataError(
             f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least {LEAST_SAMPLES}"
         )
-    noise_um = math.hypot(noise_floor(model, runs), late_error_um(model, courses, signals))
-    spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     apart = no_causes(names, runs)
     context = context_of(model, signals, apart)
     zeros = np.asarray(block_diag(*(zeros_of(run.zero_numbers) for run in runs)))
-    decays = np.asarray(block_diag(*(decays_of(record, context) for record in signals)))
+    after = [decays_of(own, context, run.holes) for run, own in zip(runs, signals, strict=True)]
+    decays = np.asarray(block_diag(*after))
     basis = basis_of(np.concatenate([zeros, decays], axis=1), used)
+
+    def residual_of(rest: str) -> Vector:
+        """Return the residual if the machine is at rest there, which effects of the model may count from."""
+        parts = [
+            run.y_um - own.y_dtf_um - own.y_tdtf_um - (effects + warm_effects_of(model, own, rest))
+            for run, own, effects in zip(runs, signals, cold, strict=True)
+        ]
+        return np.where(used, np.concatenate(parts), 0.0)
+
+    def left(rest: str) -> float:
+        open_ = residual_of(rest)
+        return float(np.linalg.norm(open_ - basis @ (basis.T @ open_)))
+
+    at_rest = min((COOLEST, EQUAL) if context.begins_warm else (COOLEST,), key=left)
+    runs = _levelled(runs, residual_of(at_rest))
+    residual = residual_of(at_rest)
+    noise_um = math.hypot(noise_floor(model, runs), late_error_um(model, courses, signals))
+    spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     # The noise of a value that was measured now and then is none of the calibration's.
     own_um = own_error_um(model, 0.0 if sparse else noise_um, spread_um)
     count, freedom = int(used.sum()), freedom_of(used, basis) if sparse else 0
@@ -293,26 +315,31 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         model=model,
         runs=tuple(runs),
         signals=tuple(signals),
-        residual=np.where(used, residual, 0.0),
+        residual=residual,
         used=used,
         zeros=zeros,
         decays=decays,
         basis=basis,
         context=context,
+        at_rest=at_rest,
         noise=NoiseTest(count=count, noise_um=noise_um, own_error_um=own_um, freedom=freedom),
         probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
         no_causes=apart,
     )
 
 
-def _levelled(run: Run, predicted: Vector) -> Run:
-    """Return a run without the steps of Y at its zeros: they are set so that the model errs by one mean about each.
+def _levelled(runs: Sequence[Run], residual: Vector) -> list[Run]:
+    """Return runs without the steps of Y at their zeros: they are set so that the model errs by one mean about each.
 
     How large they are is not known, and what is found does not depend on it: each zero is free.
     """
+    errors = np.split(residual, np.cumsum([run.t_s.size for run in runs])[:-1])
+    return [_without_steps(run, error) for run, error in zip(runs, errors, strict=True)]
+
+
+def _without_steps(run: Run, error: Vector) -> Run:
     if not run.zeros_s:
         return run
-    numbers, error, y_um = run.zero_numbers, run.y_um - predicted, run.y_um.copy()
-    for number in range(1, len(run.zeros_s) + 1):
-        y_um[numbers == number] -= np.nanmean(error[numbers == number]) - np.nanmean(error[numbers == 0])
-    return dataclasses.replace(run, y_um=y_um)
+    numbers, measured, y_um = run.zero_numbers, np.isfinite(run.y_um) & ~in_holes(run), run.y_um
+    means = [np.mean(error[measured & (numbers == number)]) for number in range(len(run.zeros_s) + 1)]
+    return dataclasses.replace(run, y_um=y_um - (np.array(means) - means[0])[numbers])

@@ -12,6 +12,7 @@ from compensator.arrays import Indices, Mask, Vector, rms_of
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
+from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.likelihood import RandomColumns
 from compensator.diagnose.outcome import FOLDS, Step
 from compensator.diagnose.own_error import own_error_alone
@@ -65,10 +66,12 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     blocks = list(evidence.blocks(FOLDS))
     progress(1, len(blocks) + 1)
     views = [evidence.without(block) for block in blocks]
+    if evidence.has_initial_state:
+        views = [view.with_initial_state(None) for view in views]  # all data say what it was; each view does by itself
     hidden = [not term.effect.observed for term in found.terms]
     unobserved = any(hidden) and not all(hidden)
     # Another process computes the columns sooner than it gets them.
-    grid = found.search.grid if executor_map is map else None
+    grid = found.search.grid if executor_map is map and not evidence.has_initial_state else None
     predicted = executor_map(
         partial(
             _predictions,
@@ -77,6 +80,7 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
             unobserved=unobserved,
             grid=grid,
             foresight=found.foresight,
+            begins_warm=evidence.has_initial_state,
             leaves_late=found.left_in is not None,
             of_time=not_deployed(found)[1],
             rests=(found.selection.fit.rest, found.selection.before.rest),
@@ -151,11 +155,13 @@ def _predictions(
     unobserved: bool,
     grid: Grid | None,
     foresight: Foresight | None,
+    begins_warm: bool,
     leaves_late: bool,
     of_time: Vector,
     rests: tuple[Rest, Rest],
 ) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
+    search = partial(findings_of, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
+    found = as_begun(search(seen), search) if begins_warm else search(seen)
     added: dict[str | Place, Vector] = {}
     total = found.own_paths
     for place in places:

@@ -6,11 +6,35 @@ once more: a path that is still warm inside acts in it, too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from compensator.diagnose.base_run import WARM_SHARE
+from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit
+from compensator.diagnose.findings import Findings
+from compensator.diagnose.fit import Fit, fit_terms
+from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.points import Points
+
+
+def as_begun(found: Findings, findings_of: Callable[[Evidence], Findings]) -> Findings:
+    """Search once more with the initial state that the named effects need, where they explain more with it.
+
+    Parameters
+    ----------
+    found : Findings
+        What was found without it.
+    findings_of : callable
+        The search.
+    """
+    fit, score = found.selection.fit, found.search.criterion.score
+    evidence = with_initial_state(fit)
+    if evidence is None or score(fit_terms(Likelihood(Points(evidence), fit.rest), fit.starts())) < score(fit) + MARGIN:
+        return found
+    again = findings_of(evidence)
+    return again if score(again.selection.fit) > score(fit) else found
 
 
 def with_initial_state(fit: Fit) -> Evidence | None:

@@ -1,4 +1,4 @@
-"""Channels that are no cause of Y: those without values, copies of others, counts, and measurements of Y itself."""
+"""Channels that are not searched: without values for some time, copies of others, counts, measurements of Y itself."""
 
 from __future__ import annotations
 
@@ -45,16 +45,20 @@ def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
         Measured data.
     """
     found: dict[str, Remark] = {}
-    common = [one for one in runs[0].channels if all(one in run.channels for run in runs)]
+    every = dict.fromkeys(channel for run in runs for channel in run.channels)
     y = [run.y_um for run in runs]
     roles = {"t_q_degc": [run.t_q_degc for run in runs], "at_degc": [run.at_degc for run in runs]}
     first = {np.round(np.concatenate(parts), _DIGITS).tobytes(): role for role, parts in roles.items()}
-    for channel in (one for one in common if not one.endswith(DISPLACEMENT)):
-        parts = [run.channels[channel] for run in runs]
+    for channel in (one for one in every if not one.endswith(DISPLACEMENT)):
+        parts = [run.channels.get(channel, np.full(run.t_s.size, np.nan)) for run in runs]
         values = np.concatenate(parts)
+        missing_h = float(np.sum(np.isnan(values))) * runs[0].period_s / 3600.0
         if np.isnan(values).all():
             found[channel] = Remark(DataRemark.COLUMN_EMPTY, f"{name}: {channel} has no value.")
-        elif np.isfinite(values).all() and np.ptp(values) > 0.0:
+        elif missing_h > 0.0:
+            words = f"{name}: {channel} is missing for {missing_h:.1f} h; not searched. Diagnose the rows that have it."
+            found[channel] = Remark(DataRemark.COLUMN_MISSING, words)
+        elif np.ptp(values) > 0.0:
             other = first.setdefault(np.round(values, _DIGITS).tobytes(), channel)
             if other != channel:
                 words = f"{name}: {channel} has the values of {other} in every row; {other} alone is searched."

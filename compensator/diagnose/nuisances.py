@@ -1,17 +1,21 @@
-"""What every record has and no effect causes: its zero, or each of its zeros, and the base model's initial state."""
+"""What every record has and no effect causes: its zeros, and the base's state as it begins or after a hole."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from compensator.arrays import Indices, Mask, Matrix
+from compensator.data.runs import Run
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 
 #: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
 STATE_PRIOR = 1e-3
+#: After so many holes, the longest ones, the state is free; it costs time.
+MOST_HOLES = 8
 #: Fastest decay of an initial state, samples, and the largest ratio of neighbouring decays.
 FASTEST, DECAY_RATIO = 2.0, 3.5
 
@@ -21,12 +25,23 @@ def zeros_of(numbers: Indices) -> Matrix:
     return np.asarray(numbers[:, None] == np.unique(numbers), dtype=np.float64)
 
 
-def decays_of(record: RecordSignals, context: Context) -> Matrix:
-    """Return decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
+def decays_of(record: RecordSignals, context: Context, holes: Sequence[tuple[int, int]] = ()) -> Matrix:
+    """Return decays from the fastest that can be seen to the base's slowest mode, each of size 1.
+
+    Those of the initial state, and of what the unknown heat in each hole leaves after it; see `Run.holes`.
+    """
     fastest = FASTEST * record.period_min
     slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])
     taus = np.geomspace(fastest, slowest, 1 + math.ceil(math.log(slowest / fastest, DECAY_RATIO))).tolist()
-    return np.column_stack([np.exp(-record.minutes / tau) for tau in taus])
+    longest = sorted(holes, key=lambda hole: hole[1] - hole[0])[-MOST_HOLES:]
+    since = [record.minutes - record.minutes[begin] for begin in (0, *sorted(end for _, end in longest))]
+    return np.column_stack([np.where(t >= 0.0, np.exp(-np.maximum(t, 0.0) / tau), 0.0) for t in since for tau in taus])
+
+
+def in_holes(run: Run) -> Mask:
+    """Return the samples in which the heat is unknown: what the model has of Y there says nothing."""
+    at = np.arange(run.t_s.size)
+    return np.asarray(np.any([(begin <= at) & (at < end) for begin, end in ((0, 0), *run.holes)], axis=0))
 
 
 def basis_of(nuisances: Matrix, used: Mask) -> Matrix:

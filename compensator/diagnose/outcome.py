@@ -193,7 +193,7 @@ class Diagnosis:
     @property
     def counts_from_rest(self) -> bool:
         """Whether an effect counts from where T_Q is AT, because the data begin warm."""
-        return any(effect.term.hypothesis.rest == EQUAL for effect in self.effects)
+        return self.evidence.at_rest == EQUAL or any(effect.term.hypothesis.rest == EQUAL for effect in self.effects)
 
     @property
     def stepped(self) -> tuple[FoundEffect, ...]:

@@ -129,7 +129,8 @@ class Points:
         context = evidence.context
         self.is_exact = not context.approximate or evidence.free_paths
         # The same for all data and for what is left where something is held out.
-        stride = max(1, math.ceil(int(np.isfinite(evidence.y_um).sum()) / POINTS))
+        # A value that was measured now and then is a point of its own.
+        stride = 1 if evidence.is_sparse else max(1, math.ceil(int(np.isfinite(evidence.y_um).sum()) / POINTS))
         edges = _edges(evidence, stride)
         first = np.concatenate(edges)
         used = evidence.used & ~_ends(evidence)

@@ -1,5 +1,7 @@
 """Records become runs: gaps, wild readings, noise, reference, other channels."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -204,14 +206,42 @@ def test_noise_skips_what_is_missing_and_of_nothing_is_nothing():
     assert noise_std(np.arange(5.0)) == 0.0
 
 
-def test_noise_of_runs_is_that_of_the_noisiest_and_noise_alone_is_seen():
+def test_noise_of_runs_is_that_of_the_noisiest_recording_and_noise_alone_is_seen():
     quiet, loud = columns(), columns(1)
     loud["y_um"] = loud["y_um"] + np.random.default_rng(9).normal(0.0, 2.0, N)
-    both = [run for c in (quiet, loud) for run in runs(c)]
+    both = [dataclasses.replace(run, recording=i) for i, c in enumerate((quiet, loud)) for run in runs(c)]
     noise = noise_of(both)
     assert noise["y_um"] == noise_std(both[1].y_um) == pytest.approx(2.0, rel=0.15)
     assert noise["t_q_degc"] == max(noise_std(run.t_q_degc) for run in both)
     assert is_noise(np.random.default_rng(10).normal(0.0, 1.0, 500)) and not is_noise(quiet["y_um"])
+
+
+def test_many_short_runs_of_a_recording_have_the_noise_of_all():
+    """That of the least lucky of 40 runs was half as much again, and "adequate" so much more lenient."""
+    rng = np.random.default_rng(4)
+    (run,) = runs(columns())
+    parts = [dataclasses.replace(run, y_um=rng.normal(0.0, 0.3, 40)) for _ in range(40)]
+    assert max(noise_std(part.y_um) for part in parts) > 0.4
+    assert noise_of(parts)["y_um"] == pytest.approx(0.3, rel=0.1)
+    assert noise_of([dataclasses.replace(part, y_std_um=1.5) for part in parts])["y_um"] == 1.5
+
+
+def test_what_a_long_gap_of_a_channel_hides_is_not_known():
+    c = columns() | {"oil_degc": np.linspace(20.0, 30.0, N)}
+    for first, last in ((0, 30), (100, 160), (300, 361)):
+        c["oil_degc"][first:last] = np.nan
+    oil = runs(c)[0].channels["oil_degc"]
+    assert np.flatnonzero(np.isnan(oil)).tolist() == list(range(300, 361))
+    assert oil[100:160] == pytest.approx(np.linspace(20.0, 30.0, N)[100:160]) and oil[0] == oil[30]
+
+
+@pytest.mark.parametrize(("every", "holes"), [(1, [(100, 110), (300, 340)]), (10, [(91, 110), (191, 210), (291, 340)])])
+def test_holes_are_gaps_that_are_longer_than_usual(every, holes):
+    c = columns()
+    for name in ("t_q_degc", "at_degc"):
+        c[name] = np.where(np.arange(N) % every == 0, c[name], np.nan)
+    c["t_q_degc"][100:110], c["t_q_degc"][200:205], c["at_degc"][300:340] = np.nan, np.nan, np.nan
+    assert list(runs(c)[0].holes) == holes
 
 
 def test_walk_is_told_apart_from_noise_and_does_not_cross_runs():
