@@ -60,7 +60,8 @@ class ProbeFile:
         self._applied_at = applied_at
         self._report = report
         self._clock, self._utc_ns = clock, utc_ns
-        self._known = b""
+        #: Whole lines at the last poll; None while the file is absent.
+        self._known: bytes | None = None
         self._polled_s: float | None = None
         self._trouble = ""
 
@@ -75,23 +76,36 @@ class ProbeFile:
         now_s = self._clock()
         late = self._polled_s is None or now_s - self._polled_s > self._settings.pause_s
         self._polled_s = now_s
-        content = self._content()
+        try:
+            content = self._content()
+        except FileNotFoundError:
+            self._known = None
+            return
         if content is None:
             return
         # Opened anew it is empty until the probe touches, which takes longer than a poll. The same content again is
-        # therefore no new probe, and another one that was never empty may have lines of any time: somebody edited it.
-        begin = len(self._known) if content.startswith(self._known) else 0
-        late = late or (begin == 0 and self._known != b"")
+        # therefore no new probe, and another one that was never empty may have lines of any time: somebody edited it,
+        # or put it here. So may several lines at once: nobody touches twice within a poll.
+        known = self._known
+        begin = len(known) if known and content.startswith(known) else 0
+        lines = content[begin:].split(b"\n")[:-1]
+        late = late or (begin == 0 and known != b"") or len(lines) > 1
         self._known = content
-        for line in content[begin:].split(b"\n")[:-1]:
+        for line in lines:
             self._handle(line.decode("ascii", "replace"), late)
 
     def _content(self) -> bytes | None:
-        """Return the whole lines of the file; None if it cannot be read, or holds no more than half a line."""
+        """Return the whole lines of the file; None if it cannot be read, or holds no more than half a line.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is absent.
+        """
         try:
             content = read_file(self._path, LONGEST)
         except FileNotFoundError:
-            return b""
+            raise
         except OSError as error:
             why = error.strerror or str(error)
             if why != self._trouble:

@@ -78,6 +78,7 @@ def test_a_line_becomes_a_probe_of_the_time_of_its_write(tmp_path: Path) -> None
 
 def test_appended_opened_anew_and_the_same_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
+    bench.write("")
     bench.write(line(50.001))
     bench.write(line(50.002), "a")
     bench.write("")
@@ -94,7 +95,9 @@ def test_appended_opened_anew_and_the_same_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("first", ["", line(50.002)[:30]])
 def test_a_file_that_was_edited_has_lines_of_any_time(tmp_path: Path, first: str) -> None:
     bench = Bench(tmp_path)
-    bench.write(line(50.001) + line(50.002))
+    bench.write("")
+    bench.write(line(50.001))
+    bench.write(line(50.002), "a")
     if first:  # seen while it is written
         bench.write(first)
     bench.write(line(50.002))
@@ -103,12 +106,35 @@ def test_a_file_that_was_edited_has_lines_of_any_time(tmp_path: Path, first: str
     assert len(bench.probes) == 3 and len(bench.reports) == 1
     bench.path.unlink()
     bench.file.poll()
+    bench.write("")
     bench.write(line(50.004))
     assert len(bench.probes) == 4 and len(bench.reports) == 1
 
 
+def test_a_file_that_was_put_there_has_lines_of_any_time(tmp_path: Path) -> None:
+    """A copy has the time of now; whoever touches sees LinuxCNC's empty file first."""
+    bench = Bench(tmp_path)
+    bench.write(line(50.001))
+    bench.path.unlink()
+    bench.file.poll()
+    bench.write(line(50.002))
+    assert not bench.probes and ["[line_age_unknown]" in report for report in bench.reports] == [True, True]
+
+
+@pytest.mark.parametrize("mode", ["w", "a"])
+def test_several_lines_at_once_are_of_any_time(tmp_path: Path, mode: str) -> None:
+    bench = Bench(tmp_path)
+    bench.write("")
+    bench.write(line(50.001))
+    if mode == "w":
+        bench.write("")
+    bench.write(line(50.002) + line(50.003), mode)
+    assert len(bench.probes) == 1 and ["[line_age_unknown]" in report for report in bench.reports] == [True, True]
+
+
 def test_half_a_line_waits(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
+    bench.write("")
     bench.write(line(50.001)[:30])
     assert not bench.probes
     bench.write(line(50.001)[30:], "a")
@@ -117,6 +143,7 @@ def test_half_a_line_waits(tmp_path: Path) -> None:
 
 def test_what_is_there_at_the_start_or_after_a_pause_is_refused(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
+    bench.write("")
     bench.write(line(50.001))
     bench.restart()
     assert len(bench.probes) == 1 and "[line_age_unknown]" in bench.reports[0]
@@ -145,12 +172,14 @@ def test_what_is_no_probe_of_this_feature_is_refused(tmp_path: Path, text: str) 
 
 def test_without_a_record_of_the_offset_nothing_is_sent(tmp_path: Path) -> None:
     bench = Bench(tmp_path, applied_um=None)
+    bench.write("")
     bench.write(line(50.001))
     assert not bench.probes and "[line_offset_unknown]" in bench.reports[0]
 
 
 def test_inches(tmp_path: Path) -> None:
     bench = Bench(tmp_path, unit="inch", nominal=2.0)
+    bench.write("")
     bench.write(line(2.001))
     assert bench.probes[0].measured_um == pytest.approx(-25.4 - 8.0)
 
@@ -166,6 +195,7 @@ def test_no_content_ends_the_reading(tmp_path: Path) -> None:
     bench.file.poll()
     bench.path.rmdir()
     bench.file.poll()
+    bench.write("")
     bench.write(line(50.001))
     assert len(bench.probes) == 1
 
