@@ -891,6 +891,11 @@ class WatchWarning(Code):
         "Check the log of the service and whether it still polls; restart it if it hangs.",
     )
     TWO_SERVICES = "two_services", "Two services publish below the same prefix.", "Stop one, or correct its prefix."
+    AXIS_MISSING = (
+        "axis_missing",
+        "Of a machine of several axes, an axis has no offset of the newest sample here, so its state is unknown.",
+        "Check the network, and what the access list permits to read, before the next precise cut.",
+    )
     MISFIT = (
         "misfit",
         "Measured and predicted Y differ by much more than the standard deviation that the service states: the model "

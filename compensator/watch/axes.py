@@ -28,6 +28,25 @@ def worst(offset: Offset, axes: Mapping[str, AxisOffset]) -> tuple[str, list[str
     return state, list(dict.fromkeys(reason for one in (offset, *same) for reason in one.reasons))
 
 
+def missing_axes(offset: Offset | None, axes: Mapping[str, AxisOffset], due: int | None = None) -> list[str]:
+    """Return the labels of the axes of a machine that have no offset of its newest sample; none if it has Y alone.
+
+    Parameters
+    ----------
+    offset : Offset or None
+        Of Y.
+    axes : mapping of str to AxisOffset
+        Those of further axes that were received last.
+    due : int, optional
+        Number of an earlier sample that is asked for instead of the newest.
+    """
+    if not isinstance(offset, AxisOffset):
+        return []
+    seqs = {axis: one.seq for axis, one in axes.items() if one.machine == offset.machine} | {FIRST: offset.seq}
+    least = max(seqs.values()) if due is None else due
+    return [label_of(axis).upper() for axis in offset.axes if axis in UNITS and seqs.get(axis, -1) < least]
+
+
 def axis_snapshot(offset: AxisOffset, axes: Mapping[str, AxisOffset], *, silent: bool) -> list[dict[str, Any]]:
     """Return the present values of every axis; an axis whose message of this sample is missing has none.
 

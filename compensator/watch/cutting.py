@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from compensator.codes import Reason, SampleQuality, State, WatchWarning, explain
+from compensator.codes import Reason, Remark, SampleQuality, State, WatchWarning, explain
 from compensator.report.local_time import here
 from compensator.watch.words import SEVERAL_SUSPECTS
 
@@ -30,6 +30,8 @@ _HAS: Mapping[str, str] = {
 _DOUBTS = (Reason.IMPLAUSIBLE, Reason.T_Q_AT_APART, Reason.CORRECTION_LIMITED, Reason.OFFSET_LIMITED)
 #: The model lacks an effect, and what to do where the service has found it.
 _LACKS = f"{Reason.IMPLAUSIBLE}:model"
+#: Warnings in which the state that is shown need not be that of the machine.
+_FORBID = {WatchWarning.AXIS_MISSING}
 _ANSWER = "The service proposes a better model: answer the proposal."
 
 
@@ -50,7 +52,7 @@ def headline(
     until_ns: int | None,
     now_ns: int,
     std_um: float | None = None,
-    warnings: Sequence[str] = (),
+    warnings: Sequence[Remark] = (),
     is_proposed: bool = False,
 ) -> Headline:
     """Return the headline of a machine.
@@ -69,8 +71,8 @@ def headline(
         Now, ns since 1970 UTC.
     std_um : float, optional
         Standard deviation of the offset, µm.
-    warnings : sequence of str
-        What the watch warns about in a state without a reason, the severest first.
+    warnings : sequence of Remark
+        What the watch warns about, the severest first.
     is_proposed : bool
         Whether the service proposes a better model: a person answers, instead of looking for one.
     """
@@ -93,7 +95,7 @@ def _headline(
     channels: Mapping[str, Mapping[str, Any]],
     until_ns: int | None,
     now_ns: int,
-    warnings: Sequence[str],
+    warnings: Sequence[Remark],
     words: Callable[[Sequence[str]], list[str]],
 ) -> Headline:
     if shown == State.STARTING and list(reasons[:1]) == [Reason.NO_ZERO]:
@@ -107,6 +109,9 @@ def _headline(
         why = lost or words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
         frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
         return Headline("no", "Do not cut to size", " ".join([*frozen, *why]))
+    forbidding = [warning for warning in warnings if warning.code in _FORBID]
+    if forbidding:
+        return Headline("no", "Do not cut to size", forbidding[0])
     if Reason.PREDICTING in reasons:
         if until_ns is None:
             return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))

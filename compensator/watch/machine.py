@@ -24,7 +24,7 @@ from compensator.messages import (
     read_message,
 )
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
-from compensator.watch.axes import axis_snapshot, worst
+from compensator.watch.axes import axis_snapshot, missing_axes, worst
 from compensator.watch.cutting import Headline, headline
 from compensator.watch.history import AHEAD_NS, MachineHistory, usable
 from compensator.watch.sequence import Sequence
@@ -55,10 +55,12 @@ TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
-ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
+ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.AXIS_MISSING, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
 _SEVERE = {*ATTENTION, WatchWarning.TWO_SERVICES}
 #: A message farther ahead of this computer's clock than this shows that the clocks differ, s.
 AHEAD_S = 5.0
+#: The offsets of the axes of one sample arrive one after the other, within this time, s.
+TOGETHER_S = 5.0
 #: Values of a snapshot that are copied from the messages.
 _OFFSET = ("state", "seq", "time_utc_ns", "valid_for_s", "y_offset_um", "y_offset_std_um", "model_sha256")
 _ESTIMATE = ("y_um", "y_pred_um", "residual_um", "heat_w", "heat_std_w")
@@ -127,6 +129,10 @@ class WatchedMachine:
         #: Offsets of further axes.
         self._axes: dict[str, AxisOffset] = {}
         self._arrived_s = 0.0
+        #: When an offset of any axis was last received that is no answer to a query: answers arrive late.
+        self._axis_arrived_s = -math.inf
+        #: Number of the offset of Y before the last one, −1 if there is none.
+        self._seq_before = -1
         #: When the other kept messages arrived, by their names in `_KEPT`.
         self._kept_s: dict[str, float] = {}
         #: Another machine name received below the same prefix, and when.
@@ -155,7 +161,7 @@ class WatchedMachine:
             self.last_malformed = str(error)[:200]
             return False
         if isinstance(message, AxisOffset) and kind != "offset":
-            return self._update_axis(axis_of(kind) or "", message)
+            return self._update_axis(axis_of(kind) or "", message, monotonic_s, asked)
         if message.machine != self.name and kind == "offset":
             if self._offset is not None:
                 self._other = (self.name, monotonic_s)
@@ -173,7 +179,11 @@ class WatchedMachine:
             return False
         if self._offset is not None and message.machine == self._offset.machine and message.seq <= self._offset.seq:
             return False
+        before = self._offset
+        self._seq_before = before.seq if before is not None and before.machine == message.machine else -1
         self._offset, self._arrived_s = message, monotonic_s
+        if not asked:
+            self._axis_arrived_s = monotonic_s
         self.history.add(message, now_ns)
         return True
 
@@ -195,12 +205,14 @@ class WatchedMachine:
         ahead = self._offset is not None and known.seq > self._offset.seq + 1
         return message.machine == known.machine and message.seq <= known.seq and not ahead
 
-    def _update_axis(self, axis: str, message: AxisOffset) -> bool:
+    def _update_axis(self, axis: str, message: AxisOffset, monotonic_s: float, asked: bool) -> bool:
         """Keep the newest offset of a further axis."""
         known = self._axes.get(axis)
         if known is not None and self._is_older(message, known):
             return False
         self._axes[axis] = message
+        if not asked:
+            self._axis_arrived_s = monotonic_s
         return True
 
     def _update_other(
@@ -286,6 +298,12 @@ class WatchedMachine:
             found.append(
                 Remark(WatchWarning.TWO_SERVICES, f"Two services publish below this prefix: {other} and {self.name}.")
             )
+        # While those of the newest sample are on their way, those of the one before are all here.
+        is_on_its_way = monotonic_s - self._axis_arrived_s <= TOGETHER_S
+        missing = missing_axes(offset, self._axes, self._seq_before if is_on_its_way else None)
+        if missing and shown != WatchWarning.SILENT:
+            figures = f"No offset of the newest sample has arrived for {', '.join(missing)}."
+            found.append(Remark(WatchWarning.AXIS_MISSING, figures))
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
             ahead_ns = offset.time_utc_ns - now_ns
             figures = f"Its clock is ahead of this computer's by {age(ahead_ns / NS)}."
@@ -395,7 +413,7 @@ class WatchedMachine:
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
-            warnings=list(map(str, sorted(warnings, key=lambda one: one.code not in _SEVERE))),
+            warnings=sorted(warnings, key=lambda one: one.code not in _SEVERE),
             is_proposed=_is_proposed(status),
         )
 

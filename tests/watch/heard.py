@@ -44,6 +44,12 @@ def offset(number: int, time_ns: int = START_NS, **changes: Any) -> bytes:
     return json.dumps(message | changes).encode()
 
 
+def axis_offset(axis: str, number: int, time_ns: int = START_NS, **changes: Any) -> bytes:
+    """One of several axes; values are those of Y."""
+    fields = json.loads(offset(number, time_ns, axis=axis, axes=["y", "z"], **changes))
+    return json.dumps({name.replace("y_", f"{axis}_", 1): value for name, value in fields.items()}).encode()
+
+
 def sample(seq: int, time_ns: int = START_NS, t_q: float | None = 31.5, quality: str = "good") -> bytes:
     def channel(mean: float | None, quality: str = "good") -> dict[str, Any]:
         return {

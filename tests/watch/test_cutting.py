@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from compensator.codes import SUFFIX_WORDS, SUFFIXES, Reason, SampleQuality, State, WatchWarning, explain
+from compensator.codes import SUFFIX_WORDS, SUFFIXES, Reason, Remark, SampleQuality, State, WatchWarning, explain
 from compensator.watch.cutting import Headline, headline
 
 NOW_NS = 1_767_600_000_000_000_000
@@ -86,8 +86,10 @@ def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
 
 def test_warnings_of_a_machine_that_is_ok_ask_for_care() -> None:
     options: dict[str, Any] = {"reasons": (), "channels": {}, "until_ns": None, "now_ns": NOW_NS}
-    found = headline(shown="ok", tone="warn", warnings=["Two services publish.", "A message is missing."], **options)
-    assert (found.cut, found.text) == ("care", "Two services publish.")
+    gone = Remark(WatchWarning.TOKEN_GONE, "Its liveliness token is gone.")
+    missed = Remark(WatchWarning.MISSED_MESSAGES, "1 message(s) did not arrive here.")
+    found = headline(shown="ok", tone="warn", warnings=[gone, missed], **options)
+    assert (found.cut, found.text) == ("care", gone)
     # Nothing is pointed at that is not there.
     assert "below" not in of("degraded").text and of("degraded").text != ""
 

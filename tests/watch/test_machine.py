@@ -16,7 +16,7 @@ from compensator.watch import past
 from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
 from compensator.watch.shop import Shop
-from tests.watch.heard import LOOP, START_NS, Clock, estimate, event, offset, sample, status
+from tests.watch.heard import LOOP, START_NS, Clock, axis_offset, estimate, event, offset, sample, status
 
 KEY = "shop/vmc-07/thermal/"
 
@@ -234,6 +234,50 @@ def test_a_service_that_is_gone_is_told_before_its_offset_is_too_old(heard: Hear
     heard.shop.set_alive(KEY + "alive", False)
     assert heard.machine["shown"] == "ok" and heard.machine["tone"] == "warn"
     assert any("liveliness token is gone" in text for text in heard.machine["warnings"])
+
+
+def test_no_machine_may_cut_whose_further_axis_never_arrived(heard: Heard) -> None:
+    heard.hear(offset=axis_offset("y", 5))
+    heard.clock.advance(3)  # they come one after the other
+    assert heard.machine["warning_codes"] == [] and heard.machine["headline"]["cut"] == "yes"
+    heard.clock.advance(3)
+    machine = heard.machine
+    assert machine["warning_codes"] == ["axis_missing"] and machine["tone"] == "warn"
+    assert machine["headline"]["cut"] == "no" and "has arrived for Z." in machine["headline"]["text"]
+    heard.hear(**{"z/offset": axis_offset("z", 5)})
+    assert heard.machine["warnings"] == [] and heard.machine["headline"]["cut"] == "yes"
+
+
+@pytest.mark.parametrize(("lost", "label"), [("y", "Y"), ("z", "Z")])
+def test_no_machine_may_cut_whose_axis_was_lost_with_the_newest_sample(heard: Heard, lost: str, label: str) -> None:
+    heard.hear(**{f"{axis}/offset": axis_offset(axis, 5) for axis in "yz"})
+    heard.clock.advance(60)
+    kept = next(axis for axis in "yz" if axis != lost)
+    heard.hear(**{f"{kept}/offset": axis_offset(kept, 6, heard.clock.now_ns)})
+    assert heard.machine["headline"]["cut"] == "yes"
+    heard.clock.advance(6)
+    assert heard.machine["headline"]["cut"] == "no" and f"for {label}." in heard.machine["warnings"][0]
+
+
+def test_an_axis_that_stays_away_is_not_taken_to_be_on_its_way_with_each_sample(heard: Heard) -> None:
+    heard.hear(**{f"{axis}/offset": axis_offset(axis, 5) for axis in "yz"})
+    for seq in (6, 7):
+        heard.clock.advance(60)
+        heard.hear(**{"y/offset": axis_offset("y", seq, heard.clock.now_ns)})
+        assert heard.machine["headline"]["cut"] == ("yes" if seq == 6 else "no")
+    heard.hear(**{"y/offset": axis_offset("y", 3, heard.clock.now_ns, machine="vmc-08")})
+    assert "axis_missing" not in heard.machine["warning_codes"]  # numbers of another machine
+
+
+def test_an_axis_that_answers_no_query_is_missing_at_once() -> None:
+    """`watch --once` shows what was answered and waits for nothing."""
+    shop = Shop(Clock())
+    shop.receive(KEY + "y/offset", axis_offset("y", 5), asked=True)
+    machine = shop.one("shop/vmc-07")
+    assert machine is not None and machine["headline"]["cut"] == "no"
+    shop.receive(KEY + "z/offset", axis_offset("z", 5), asked=True)
+    machine = shop.one("shop/vmc-07")
+    assert machine is not None and machine["headline"]["cut"] == "yes"
 
 
 def test_a_probe_that_sees_more_than_the_service_states_is_told_after_half_an_hour(heard: Heard) -> None:
