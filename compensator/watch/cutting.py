@@ -30,9 +30,11 @@ _HAS: Mapping[str, str] = {
 _DOUBTS = (Reason.IMPLAUSIBLE, Reason.T_Q_AT_APART, Reason.CORRECTION_LIMITED, Reason.OFFSET_LIMITED)
 #: The model lacks an effect, and what to do where the service has found it.
 _LACKS = f"{Reason.IMPLAUSIBLE}:model"
-#: Warnings in which the state that is shown need not be that of the machine.
-_FORBID = {WatchWarning.AXIS_MISSING}
 _ANSWER = "The service proposes a better model: answer the proposal."
+#: Warnings that need attention although the service itself reports `ok`.
+ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.AXIS_MISSING, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
+#: With these the offset and the state that are shown need not be those of the machine.
+FORBID = {WatchWarning.TWO_SERVICES, WatchWarning.AXIS_MISSING}
 
 
 class Headline(NamedTuple):
@@ -109,16 +111,19 @@ def _headline(
         why = lost or words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
         frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
         return Headline("no", "Do not cut to size", " ".join([*frozen, *why]))
-    forbidding = [warning for warning in warnings if warning.code in _FORBID]
+    forbidding = [warning for warning in warnings if warning.code in FORBID]
     if forbidding:
         return Headline("no", "Do not cut to size", forbidding[0])
+    # What the service cannot know of itself stands beside what it says.
+    severe = [warning for warning in warnings if warning.code in ATTENTION][:1]
     if Reason.PREDICTING in reasons:
         if until_ns is None:
-            return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))
+            parts = [*lost, "Predicted for a limited time, then held.", *severe]
+            return Headline("care", "Cut with care", " ".join(parts))
         minutes = max(until_ns - now_ns, 0) / 60e9
         held = f"Predicted for another {minutes:.0f} min, then held."
-        parts = [*lost[:1], held, *lost[1:], *words(doubts[:1])[:1]]
-        may = "Cut with care" if doubts else "May cut"
+        parts = [*lost[:1], held, *lost[1:], *words(doubts[:1])[:1], *severe]
+        may = "Cut with care" if doubts or severe else "May cut"
         return Headline("until", f"{may} until {here(until_ns):%H:%M}", " ".join(parts))
     suspects = [reason.partition(":")[2] for reason in reasons if reason.startswith(f"{Reason.IMPLAUSIBLE}:")]
     if len(suspects) > 1:
@@ -126,11 +131,11 @@ def _headline(
         lacks = "the model lacks an effect" if "model" in suspects else ""
         causes = " or ".join(filter(None, (lacks, others)))
         text = f"Measured and predicted Y diverge; not known yet whether {causes}."
-        return Headline("care", "Cut with care", f"{text} {SEVERAL_SUSPECTS}")
+        return Headline("care", "Cut with care", " ".join([text, SEVERAL_SUSPECTS, *severe]))
     if doubts:
-        return Headline("care", "Cut with care", " ".join(words(doubts[:1])))
+        return Headline("care", "Cut with care", " ".join([*words(doubts[:1]), *severe]))
     if reasons:
-        return Headline("care", "Cut with care", " ".join([*lost, *([] if lost else words(reasons[:1]))]))
+        return Headline("care", "Cut with care", " ".join([*(lost or words(reasons[:1])), *severe]))
     if tone != "good":
         return Headline("care", "Cut with care", " ".join(warnings[:1] or words([shown])))
     return Headline("yes", "May cut", "The offset follows the model.")

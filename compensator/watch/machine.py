@@ -25,7 +25,7 @@ from compensator.messages import (
 )
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
 from compensator.watch.axes import axis_snapshot, missing_axes, worst
-from compensator.watch.cutting import Headline, headline
+from compensator.watch.cutting import ATTENTION, FORBID, Headline, headline
 from compensator.watch.history import AHEAD_NS, MachineHistory, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import (
@@ -54,9 +54,6 @@ EVENTS = 50
 TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
-#: Warnings that need attention although the service itself reports `ok`.
-ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.AXIS_MISSING, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
-_SEVERE = {*ATTENTION, WatchWarning.TWO_SERVICES}
 #: A message farther ahead of this computer's clock than this shows that the clocks differ, s.
 AHEAD_S = 5.0
 #: The offsets of the axes of one sample arrive one after the other, within this time, s.
@@ -413,7 +410,7 @@ class WatchedMachine:
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
-            warnings=sorted(warnings, key=lambda one: one.code not in _SEVERE),
+            warnings=sorted(warnings, key=lambda one: one.code not in ATTENTION | FORBID),
             is_proposed=_is_proposed(status),
         )
 

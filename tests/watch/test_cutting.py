@@ -10,6 +10,9 @@ from compensator.codes import SUFFIX_WORDS, SUFFIXES, Reason, Remark, SampleQual
 from compensator.watch.cutting import Headline, headline
 
 NOW_NS = 1_767_600_000_000_000_000
+GONE = Remark(WatchWarning.TOKEN_GONE, "Its liveliness token is gone.")
+TWO = Remark(WatchWarning.TWO_SERVICES, "Two services publish below this prefix: vmc-07 and vmc-08.")
+MISSED = Remark(WatchWarning.MISSED_MESSAGES, "1 message(s) did not arrive here.")
 
 
 def of(shown: str, *reasons: str, tone: str = "warn", until_min: float | None = None, **channels: str) -> Headline:
@@ -86,12 +89,37 @@ def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
 
 def test_warnings_of_a_machine_that_is_ok_ask_for_care() -> None:
     options: dict[str, Any] = {"reasons": (), "channels": {}, "until_ns": None, "now_ns": NOW_NS}
-    gone = Remark(WatchWarning.TOKEN_GONE, "Its liveliness token is gone.")
-    missed = Remark(WatchWarning.MISSED_MESSAGES, "1 message(s) did not arrive here.")
-    found = headline(shown="ok", tone="warn", warnings=[gone, missed], **options)
-    assert (found.cut, found.text) == ("care", gone)
+    found = headline(shown="ok", tone="warn", warnings=[GONE, MISSED], **options)
+    assert (found.cut, found.text) == ("care", GONE)
     # Nothing is pointed at that is not there.
     assert "below" not in of("degraded").text and of("degraded").text != ""
+
+
+@pytest.mark.parametrize(
+    ("until_min", "reasons", "word"),
+    [
+        (20.0, ("t_q_missing", "predicting"), "Cut with care until "),
+        (None, ("t_q_missing", "predicting"), "Cut with care"),
+        (None, ("implausible:at_degc", "implausible:model"), "Cut with care"),
+        (None, ("implausible:model",), "Cut with care"),
+        (None, ("rate_limited",), "Cut with care"),
+        (None, ("t_q_missing",), "Cut with care"),
+    ],
+)
+def test_what_the_service_cannot_know_stands_beside_its_reasons(
+    until_min: float | None, reasons: tuple[str, ...], word: str
+) -> None:
+    options: dict[str, Any] = {"shown": "degraded", "tone": "warn", "reasons": reasons, "channels": {}}
+    options |= {"until_ns": None if until_min is None else NOW_NS + round(until_min * 60e9), "now_ns": NOW_NS}
+    without = headline(**options, warnings=[MISSED])
+    found = headline(**options, warnings=[GONE, MISSED])
+    assert found.word.startswith(word) and found.text == f"{without.text} {GONE}"
+    assert headline(**options, warnings=[TWO, GONE]) == Headline("no", "Do not cut to size", TWO)
+
+
+def test_nobody_cuts_by_the_offset_of_one_of_two_services() -> None:
+    found = headline(shown="ok", tone="bad", reasons=(), channels={}, until_ns=None, now_ns=NOW_NS, warnings=[TWO])
+    assert found == Headline("no", "Do not cut to size", TWO)
 
 
 def test_several_suspects_send_nobody_to_a_healthy_sensor() -> None:
