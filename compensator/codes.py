@@ -930,7 +930,7 @@ class WatchWarning(Code):
 
 
 class AuditRemark(Code):
-    """Remarks of an audit on recordings that are in order."""
+    """Remarks of an audit on recordings that are in order, and of a comparison of models on recordings."""
 
     NOT_REPLAYED = (
         "not_worked_out",
@@ -971,6 +971,11 @@ class AuditRemark(Code):
         "begins_running",
         "The comparison starts while the machine is running, and the other model has no state except the zero.",
         "Ignore the first hours, or compare from a recording that starts at rest.",
+    )
+    NOT_READ = (
+        "not_read",
+        "A recording is damaged or was cut off, so the figures are without the rest of it.",
+        "Audit it without --model, and compare on a copy from a backup.",
     )
     SIGNATURE_NOT_CHECKED = (
         "signature_not_checked",

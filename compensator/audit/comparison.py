@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 
 from compensator.audit.findings import utc
+from compensator.audit.recording_audit import not_left_by_a_kill
 from compensator.axes import column_of, label_of
 from compensator.clock import NS
 from compensator.codes import AuditRemark, Remark
@@ -20,11 +21,11 @@ from compensator.events import EventKind
 from compensator.messages import EstimateMessage, Offset, number
 from compensator.messages_axes import AxesEstimate, further_values
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording.container import Container, Contents
+from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import in_order
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_in
+from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_until_damage
 from compensator.service.status import Zero
 
 #: Columns of the table of both offsets.
@@ -204,18 +205,26 @@ def compare(
     Raises
     ------
     DataError
-        If a file is not a recording, the files belong to several machines, or the model needs a missing channel.
+        If a file is not a recording or a copy of another one, the files belong to several machines, or the model needs
+        a missing channel.
     """
     ordered = in_order(paths)
     total = sum(path.stat().st_size for path in ordered)
     run = _Run(model, row, point, data)
     done = 0
     for path in ordered:
+        before = run.samples
         with Container(path) as container:
-            for count, step in enumerate(steps_in(container)):
-                run.add(step, container.contents)
-                if progress is not None and count % 1000 == 0:
-                    progress(done + container.position, total)
+            try:
+                for count, step in enumerate(steps_until_damage(container)):
+                    run.add(step, container.contents)
+                    if progress is not None and count % 1000 == 0:
+                        progress(done + container.position, total)
+            except Damaged as damage:
+                if not_left_by_a_kill(damage, container.contents) is not None:
+                    run.remark(
+                        AuditRemark.NOT_READ, f"{path.name}: only a part could be read, {run.samples - before} samples."
+                    )
         done += path.stat().st_size
     return run.result(ordered)
 
@@ -245,6 +254,15 @@ class _Run:
             self._compare(estimate, offset, result)
             if result.further and isinstance(estimate, AxesEstimate):
                 self._compare_axes(estimate, step.further, result)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples that were compared."""
+        return self._result.samples
+
+    def remark(self, code: AuditRemark, figures: str) -> None:
+        """Add a remark on the validity of the figures."""
+        self._result.remarks.append(Remark(code, figures))
 
     def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
         """Return the run with the other model and the configuration of the file."""
@@ -292,7 +310,7 @@ class _Run:
             f"{step.file}: starts while the machine is running, and the other model has no state except the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
         )
-        self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
+        self.remark(AuditRemark.BEGINS_RUNNING, figures)
 
     def _compare(self, estimate: EstimateMessage, offset: Offset, outcome: Outcome) -> None:
         result, sample = self._result, outcome.sample

@@ -12,10 +12,10 @@ from compensator.audit.chain_check import ChainCheck
 from compensator.audit.findings import Fault
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.codes import AuditFinding, RecordingEnd
+from compensator.codes import RecordingEnd
 from compensator.errors import CompensatorError, DataError
 from compensator.messages import UNREADABLE
-from compensator.recording.container import Container, Damaged, Torn
+from compensator.recording.container import Container, Contents, Damaged, Torn
 from compensator.recording.naming import named_of
 from compensator.recording.reading import RawRecord, groups_of
 from compensator.recording.signature import Verifier
@@ -184,27 +184,33 @@ class _Audit:
                 result.find(Fault.BEHIND_CHAIN, rest[0], count=len(rest))
             elif chain.head and not result.seal:
                 result.find(Fault.NO_SEAL, topic="seal")
-        elif not isinstance(error, Torn):
-            result.end = AuditFinding.DAMAGED
-            result.find(Fault.DAMAGED, offset=error.offset, what=error.text)
-        elif self._was_compact(error):
-            result.end = AuditFinding.TRUNCATED
-            result.find(Fault.CUT_OFF, offset=error.offset)
-        elif _covers_others(error.rest):
-            result.end = AuditFinding.DAMAGED
-            result.find(Fault.LENGTH_CHANGED, offset=error.offset)
+            return
+        fault = not_left_by_a_kill(error, self._contents)
+        if fault is not None:
+            result.end = fault.kind
+            result.find(fault, offset=error.offset, what=error.text)
         elif result.seal:
             result.end = RecordingEnd.FINISHED
         else:
-            result.end = RecordingEnd.TORN if rest or error.rest or error.offset < result.size else RecordingEnd.OPEN
+            torn = isinstance(error, Torn) and error.rest
+            result.end = RecordingEnd.TORN if rest or torn or error.offset < result.size else RecordingEnd.OPEN
 
-    def _was_compact(self, torn: Torn) -> bool:
-        """Return whether the file had been finished: only then metadata and attachments come before the channels."""
-        contents = self._contents
-        if contents.channels:
-            return contents.chunked
-        begun = bool(contents.metadata or contents.attachments)
-        return begun or torn.rest[:1] in (_ATTACHMENT, _METADATA, _CHUNK)
+
+def not_left_by_a_kill(error: Damaged, contents: Contents) -> Fault | None:
+    """Return what was done to a file that cannot be read any further; None if a kill, or one being written, ends so."""
+    if not isinstance(error, Torn):
+        return Fault.DAMAGED
+    if _was_compact(error, contents):
+        return Fault.CUT_OFF
+    return Fault.LENGTH_CHANGED if _covers_others(error.rest) else None
+
+
+def _was_compact(torn: Torn, contents: Contents) -> bool:
+    """Return whether the file had been finished: only then metadata and attachments come before the channels."""
+    if contents.channels:
+        return contents.chunked
+    begun = bool(contents.metadata or contents.attachments)
+    return begun or torn.rest[:1] in (_ATTACHMENT, _METADATA, _CHUNK)
 
 
 def _covers_others(rest: bytes) -> bool:

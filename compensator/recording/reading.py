@@ -299,14 +299,19 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     Raises
     ------
     DataError
-        If a file is not an MCAP file, or the files belong to several machines.
+        If a file is not an MCAP file, the files belong to several machines, or one is a copy of another.
     """
     began: dict[Path, str] = {}
     machines: set[str] = set()
+    created: dict[tuple[str | None, str], Path] = {}
     for path in dict.fromkeys(paths):
         run = run_of(path)
         machines |= {run["machine"]} if "machine" in run else set()
         began[path] = run.get("file", path.name).removesuffix(".mcap")
+        # A torn beginning says nothing of itself.
+        other = created.setdefault((run.get("machine"), run["file"]), path) if "file" in run else path
+        if other != path:
+            raise DataError(f"{path}: a copy of {other}, expected each recording once")
     if len(machines) > 1:
         raise DataError(f"recordings of {', '.join(sorted(machines))}; expected those of one machine")
     return sorted(began, key=lambda path: order_of(began[path]))

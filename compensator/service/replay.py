@@ -159,9 +159,22 @@ def steps_in(container: Container) -> Iterator[RecordedStep]:
         If it is not a recording of the service.
     """
     with suppress(Damaged):
-        for records, _, _ in groups_of(container):
-            if records:
-                yield step_of(records, container.contents, container.path.name)
+        yield from steps_until_damage(container)
+
+
+def steps_until_damage(container: Container) -> Iterator[RecordedStep]:
+    """Yield the groups as `steps_in` does, and say why it cannot be read any further.
+
+    Raises
+    ------
+    DataError
+        If it is not a recording of the service.
+    Damaged
+        If its end is missing, or it is damaged.
+    """
+    for records, _, _ in groups_of(container):
+        if records:
+            yield step_of(records, container.contents, container.path.name)
 
 
 def steps_of(path: Path) -> Iterator[RecordedStep]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -21,6 +23,7 @@ from compensator.model.model_file import parse_model
 from compensator.recording.reading import read_messages, recordings
 from compensator.service.compensation import Compensation
 from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, QUILL, Service, other_model, readings
+from tests.audit.tampering import rewrite
 from tests.service.simulated import START_NS
 
 EVENING_NS = START_NS + 17 * 60 * MINUTE_NS
@@ -130,6 +133,44 @@ def test_recordings_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
     other.close()
     with pytest.raises(DataError, match="lathe-1, vmc-07"):
         compare(list(tmp_path.glob("*.mcap")), OTHER)
+
+
+def halved(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def flipped(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize("harm", [halved, flipped])
+def test_a_file_of_which_only_a_part_can_be_read_is_remarked(tmp_path: Path, harm: Callable[[bytes], bytes]) -> None:
+    Service(tmp_path).run(300).stop()
+    path = recordings(tmp_path, MACHINE)[0]
+    rewrite(path, chunk_size=20_000)  # before it was one chunk, all or nothing
+    assert not compare([path], OTHER).remarks
+    path.write_bytes(harm(path.read_bytes()))
+    found = compare([path], OTHER)
+    assert 0 < found.samples < 300 and [remark.code for remark in found.remarks] == ["not_read"]
+    assert f"{path.name}: only a part could be read, {found.samples} samples." in found.text()
+
+
+@pytest.mark.parametrize("cut", [0, 10])
+def test_what_a_kill_leaves_is_no_part(tmp_path: Path, cut: int) -> None:
+    Service(tmp_path).run(30).kill()
+    path = recordings(tmp_path, MACHINE)[0]
+    path.write_bytes(path.read_bytes()[: -cut or None])
+    assert not compare([path], OTHER).remarks
+
+
+def test_no_recording_counts_twice(tmp_path: Path) -> None:
+    Service(tmp_path).run(5).stop()
+    path = recordings(tmp_path, MACHINE)[0]
+    copied = tmp_path / "backup of monday.mcap"
+    shutil.copy(path, copied)
+    with pytest.raises(DataError, match=f"{copied}: a copy of {path}"):
+        compare([path, copied], OTHER)
 
 
 def test_the_table_is_csv(tmp_path: Path) -> None:
