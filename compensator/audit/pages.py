@@ -142,8 +142,10 @@ def _proven(found: Audit) -> Table:
         ],
         [
             "No file is missing between the first and the last",
-            no if of_files else yes if whole else open_,
-            "each chain starts with the last value of the previous file",
+            no if of_files else yes if whole and not found.restarts else open_,
+            f"a new chain begins with {_few(found.restarts)}"
+            if found.restarts
+            else "each chain starts with the last value of the previous file",
         ],
         [
             "Readers that seek find exactly the records of the file",
@@ -160,12 +162,16 @@ def _proven(found: Audit) -> Table:
         [
             "Nothing was cut off after the last record",
             no if cut or ends else yes if whole else open_,
-            f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
+            f"no end: {_few(ends)}" if ends else "every file has its end",
         ],
         ["The recordings before the first file are intact", open_, "they were not given"],
         ["The sensors measured correctly", open_, "a recording cannot show this"],
     ]
     return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" …" if len(names) > 3 else "")
 
 
 def _difference(difference: Difference) -> Table:

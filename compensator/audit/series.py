@@ -43,6 +43,8 @@ class Audit:
         Observations that are not findings.
     signed : bool
         Whether signatures were checked against a key.
+    restarts : tuple of str
+        Files that begin a new chain behind others of their machine: no link shows whether one is missing before them.
     """
 
     files: tuple[RecordingAudit, ...]
@@ -51,6 +53,7 @@ class Audit:
     difference: Difference | None
     remarks: tuple[Remark, ...]
     signed: bool
+    restarts: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -280,6 +283,7 @@ def combine(
         difference=next((file.difference for file in files if file.difference), None),
         remarks=tuple(series.remarks),
         signed=signed,
+        restarts=tuple(series.restarts),
     )
 
 
@@ -323,6 +327,7 @@ class _Series:
         self._live = newest or (max(own, key=lambda file: _started(file.original)).file if own else "")
         self._signed = signed
         self.remarks: list[Remark] = []
+        self.restarts: list[str] = []
 
     def _find(self, fault: Fault, file: RecordingAudit, **figures: Any) -> None:
         self.own[file.file].find(fault, **figures)
@@ -424,17 +429,20 @@ class _Series:
             if began and after.previous != NOTHING.hex():
                 self._find(Fault.MORE_WAS_THERE, named, next=after.file)
             elif began and before is not None:
-                figures = f"{after.file}: starts a new chain; it states that {named.file} held no record"
-                self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, f"{figures}."))
+                self._restart(after, f"{named.file} held no record")
         elif before is None:
             self._check_first(after)
         elif after.previous == before.last:
             self._check_state(before, after)
         elif not after.previous_file:
-            figures = f"{after.file}: starts a new chain; it states that there was no earlier recording."
-            self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, figures))
+            self._restart(after, "there was no earlier recording")
         else:
             self._explain_break(before, after)
+
+    def _restart(self, file: RecordingAudit, stated: str) -> None:
+        self.restarts.append(file.file)
+        figures = f"{file.file}: starts a new chain; it states that {stated}."
+        self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, figures))
 
     def _explain_break(self, before: RecordingAudit, after: RecordingAudit) -> None:
         named = self._names.get(after.previous_file)
@@ -486,6 +494,12 @@ def summary(found: Audit) -> str:
     if found.chained and not found.findings_count:
         records = sum(file.records for file in found.chained)
         between = "between the first and the last of them nothing was changed, removed, inserted or moved"
+        if found.restarts:
+            chains = len(found.restarts) + len({file.machine for file in found.chained})
+            between = (
+                f"within each of the {chains} chains nothing was changed, removed, inserted or moved; between them "
+                "files may be missing"
+            )
         lines.append(f"The hash chain holds over {records} records; {between}.")
         if not found.signed:
             lines.append(

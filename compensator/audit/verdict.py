@@ -23,6 +23,8 @@ def verdict(found: Audit) -> str:
         unknown = f"; {emptied} of them without a record, which may have been removed" if emptied else ""
         if not found.samples:
             return f"Proven in part: the records of {files} are unchanged; none of them is a sample{unknown}."
+        if not unknown and found.restarts:
+            unknown = f"; before {found.restarts[0]}, which begins a new chain, files may be missing"
         unknown = unknown or "; see what was not checked"
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}{unknown}."
     words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
@@ -34,4 +36,5 @@ def verdict(found: Audit) -> str:
 
 def partly(found: Audit) -> bool:
     """Return whether a part could not be checked."""
-    return not found.samples or any(not file.last or file.not_replayed for file in found.files)
+    unchecked = any(not file.last or file.not_replayed for file in found.files)
+    return not found.samples or unchecked or bool(found.restarts)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from compensator.audit.findings import Finding
+from compensator.audit.pages import audit_page
 from compensator.audit.series import Audit, audit, summary
 from compensator.audit.verdict import verdict
 from compensator.recording.container import Attachment, Contents
@@ -430,6 +431,23 @@ def test_what_the_last_file_held_is_not_said_to_be_proven(folder: Path, left: in
     # The next start continues from the file before, and so shows that this one held nothing then.
     Service(folder, start_ns=EVENING_NS + 80 * MINUTE_NS, seq=50).run(5).stop()
     assert not look(folder).perhaps_emptied and "no later file" not in " ".join(look(folder).remarks)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_between_two_chains_nothing_is_said_to_be_proven(folder: Path, tmp_path: Path, missing: bool) -> None:
+    """A new installation begins a chain of its own; so does whoever removes what was before."""
+    Service(tmp_path / "new", start_ns=EVENING_NS + 80 * MINUTE_NS, seq=50).run(5).stop()
+    paths = [*recordings(folder, MACHINE), *recordings(tmp_path / "new", MACHINE)]
+    if missing:
+        del paths[2]
+    found = audit(paths)
+    assert found.clean and found.restarts == (paths[-1].name,)
+    assert verdict(found).startswith("Proven in part: ")
+    assert f"before {paths[-1].name}, which begins a new chain, files may be missing" in verdict(found)
+    assert "within each of the 2 chains nothing was changed" in summary(found)
+    rows = {str(row[0]): row[1:] for row in audit_page(found).blocks[1].rows}  # type: ignore[union-attr]
+    outcome, how = rows["No file is missing between the first and the last"]
+    assert str(outcome).startswith("–") and how == f"a new chain begins with {paths[-1].name}"
 
 
 def test_a_live_file_cut_anywhere_is_what_a_kill_leaves(folder: Path, tmp_path: Path) -> None:
