@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,8 +42,14 @@ _REMARKS = 40
 #: Number of values that are added to a curve at once.
 _TOGETHER = 5000
 _ENDS_WHOLE = (RecordingEnd.FINISHED, RecordingEnd.RECOVERED)
-#: Kinds of findings that are about several files.
-_OF_FILES = (AuditFinding.MISSING_FILE, AuditFinding.BROKEN, AuditFinding.STATE, AuditFinding.REORDERED)
+#: Kinds of findings that are about a statement of their own, or about none; the others are by their place.
+_APART = (
+    AuditFinding.UNSIGNED,
+    AuditFinding.FALSE_SIGNATURE,
+    AuditFinding.TRUNCATED,
+    AuditFinding.INDEX,
+    AuditFinding.EMPTY,
+)
 
 
 # ---------------------------------------------------------------------------- audit
@@ -121,14 +126,14 @@ def _proven(found: Audit) -> Table:
     yes, no, open_ = "✓ proven", "✗ not proven", "– not checked"
     chained = found.chained
     records = sum(file.records for file in chained)
-    kinds = Counter(finding.kind for finding in found.findings)
-    of_files = sum(kinds[kind] for kind in _OF_FILES)
+    kinds = found.counts
+    of_files = sum(count for kind, count in found.of_files.items() if kind not in _APART)
+    of_records = sum(count for kind, count in kinds.items() if kind not in _APART) - of_files
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
     worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
     not_signed = kinds[AuditFinding.UNSIGNED] + kinds[AuditFinding.FALSE_SIGNATURE]
     cut, index = kinds[AuditFinding.TRUNCATED], kinds[AuditFinding.INDEX]
-    inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
             "Every estimate and every offset is the one that this program computes from the samples",
@@ -137,7 +142,7 @@ def _proven(found: Audit) -> Table:
         ],
         [
             "No record was changed, removed, inserted or moved",
-            no if inside > 0 else yes if whole else open_,
+            no if of_records else yes if whole else open_,
             f"hash chain over {records} records in {len(chained)} of {len(found.files)} file(s)",
         ],
         [

@@ -12,7 +12,7 @@ from compensator.audit.chain_check import ChainCheck
 from compensator.audit.findings import Fault
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.codes import RecordingEnd
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.errors import CompensatorError, DataError
 from compensator.messages import UNREADABLE
 from compensator.recording.container import Container, Contents, Damaged, Torn
@@ -93,7 +93,7 @@ class _Audit:
         self._classify(error, chain)
         for where, what in self._container.index.faults:
             self._result.find(Fault.INDEX, topic=where, what=what)
-        self._result.findings_count += self._container.index.count - len(self._container.index.faults)
+        self._result.counts[AuditFinding.INDEX] += self._container.index.count - len(self._container.index.faults)
         self._result.outside = self._container.outside()
         if chain.head:
             chain.finish()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,8 +31,8 @@ class RecordingAudit:
         How it ends: with or without an end, or truncated or damaged.
     is_recording : bool
         Whether it could be opened and is a recording of the service; if not, it has no place in the series.
-    findings, findings_count : list of Finding, int
-        The first findings, and the number of all findings.
+    findings, counts : list of Finding, Counter
+        The first findings, and the number of all findings of each kind.
     records : int
         Records in the chain.
     signed, unsigned_behind, unsigned_samples, unsigned_most : int
@@ -88,7 +89,7 @@ class RecordingAudit:
     end: RecordingEnd | AuditFinding = RecordingEnd.FINISHED
     is_recording: bool = True
     findings: list[Finding] = field(default_factory=list)
-    findings_count: int = 0
+    counts: Counter[AuditFinding] = field(default_factory=Counter)
     records: int = 0
     signed: int = 0
     proven: bool = False
@@ -120,6 +121,11 @@ class RecordingAudit:
     model: str = ""
     state_before: str = ""
     state_after: str = ""
+
+    @property
+    def findings_count(self) -> int:
+        """Number of all findings."""
+        return self.counts.total()
 
     @property
     def may_be_live(self) -> bool:
@@ -162,7 +168,7 @@ class RecordingAudit:
         """
         if at is not None:
             topic, sequence, time_utc_ns = at.topic, at.sequence, at.log_time_ns
-        self.findings_count += 1
+        self.counts[fault.kind] += 1
         if len(self.findings) < KEPT:
             self.findings.append(
                 Finding(
@@ -183,7 +189,8 @@ class RecordingAudit:
             place = (finding.topic, finding.sequence)
             if finding.kind == AuditFinding.INSERTED and place in missing:
                 self.findings[i] = replace(finding, kind=Fault.MOVED.kind, text=Fault.MOVED.sentence)
+                self.counts.update({finding.kind: -1, Fault.MOVED.kind: 1})
                 moved.add(place)
         kept = [f for f in self.findings if f.kind != AuditFinding.REMOVED or (f.topic, f.sequence) not in moved]
-        self.findings_count -= len(self.findings) - len(kept)
+        self.counts[AuditFinding.REMOVED] -= len(self.findings) - len(kept)
         self.findings = kept

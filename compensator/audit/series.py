@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
@@ -35,8 +36,8 @@ class Audit:
         In the order of their start.
     findings : tuple of Finding
         The first findings of each file, file by file.
-    findings_count : int
-        Number of all findings.
+    counts, of_files : Counter
+        Number of all findings of each kind, and of those that are about the file's place among the others.
     difference : Difference, optional
         The first sample that the replay does not reproduce.
     remarks : tuple of Remark
@@ -49,11 +50,17 @@ class Audit:
 
     files: tuple[RecordingAudit, ...]
     findings: tuple[Finding, ...]
-    findings_count: int
+    counts: Counter[AuditFinding]
+    of_files: Counter[AuditFinding]
     difference: Difference | None
     remarks: tuple[Remark, ...]
     signed: bool
     restarts: tuple[str, ...] = ()
+
+    @property
+    def findings_count(self) -> int:
+        """Number of all findings."""
+        return self.counts.total()
 
     @property
     def samples(self) -> int:
@@ -276,10 +283,12 @@ def combine(
         series.check_nothing(files)
     own = {name: whole.findings for name, whole in series.own.items()}  # of two files of one name once
     findings = [finding for file in files for finding in (*own.pop(file.file, ()), *file.findings)]
+    of_files = sum((one.counts for one in series.own.values()), Counter[AuditFinding]())
     return Audit(
         files=tuple(files),
         findings=tuple(findings),
-        findings_count=sum(file.findings_count for file in (*series.own.values(), *files)),
+        counts=sum((file.counts for file in files), of_files),
+        of_files=of_files,
         difference=next((file.difference for file in files if file.difference), None),
         remarks=tuple(series.remarks),
         signed=signed,

@@ -6,17 +6,23 @@ import html
 import math
 import re
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from compensator.audit.comparison import AxisComparison, Comparison
+from compensator.audit.findings import KEPT
 from compensator.audit.pages import Curves, comparison_page
 from compensator.cli import main
+from compensator.recording.container import MAGIC
+from compensator.recording.framing import CHUNK_INDEX, FOOTER
 from compensator.recording.reading import recordings
 from compensator.report.history import Spread
 from tests.audit.made import MACHINE, Service, other_model
+from tests.audit.tampering import Line, rewrite
 from tests.audit.test_command import tampered
 
 
@@ -70,6 +76,47 @@ def test_a_file_that_is_missing_is_not_proven(tmp_path: Path, capsys: pytest.Cap
     recordings(tmp_path / "rec", MACHINE)[1].unlink()
     text = page(capsys, 3, tmp_path / "rec")
     assert [*outcomes(text).values()][:3] == ["✓", "✓", "✗"] and 'href="#word-missing_file"' in text
+
+
+@pytest.mark.parametrize(("which", "distance"), [("sample", 1), ("chain", 3)])
+def test_records_in_another_place_are_no_missing_file(
+    rec: Path, capsys: pytest.CaptureFixture[str], which: str, distance: int
+) -> None:
+    def exchange(lines: list[Line]) -> list[Line]:
+        i = [i for i, line in enumerate(lines) if line.topic == which][20]
+        lines[i], lines[i + distance] = lines[i + distance], lines[i]
+        return lines
+
+    rewrite(recordings(rec, MACHINE)[0], exchange)
+    text = page(capsys, 3, rec)
+    assert [*outcomes(text).values()][1:3] == ["✗", "✓"] and 'href="#word-reordered"' in text
+
+
+def test_an_index_is_no_record_however_many_places_of_it_are_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Service(tmp_path / "rec").run(120).stop()
+    path = recordings(tmp_path / "rec", MACHINE)[0]
+    rewrite(path, chunk_size=600)
+    path.write_bytes(with_shifted_chunk_indexes(path.read_bytes()))
+    text = page(capsys, 3, tmp_path / "rec")
+    count = re.search(r"Not proven: (\d+) finding", text)
+    assert count is not None and int(count[1]) > KEPT
+    assert [*outcomes(text).values()][1:4] == ["✓", "✓", "✗"]
+
+
+def with_shifted_chunk_indexes(data: bytes) -> bytes:
+    """Move the first time of every chunk in the summary, whose CRC is right again."""
+    changed = bytearray(data)
+    footer = len(data) - len(MAGIC) - 29
+    start = at = struct.unpack_from("<Q", data, footer + 9)[0]
+    while data[at] != FOOTER:
+        code, length = struct.unpack_from("<BQ", data, at)
+        if code == CHUNK_INDEX:
+            struct.pack_into("<Q", changed, at + 9, struct.unpack_from("<Q", data, at + 9)[0] + 1)
+        at += 9 + length
+    struct.pack_into("<I", changed, footer + 25, zlib.crc32(changed[start : footer + 25]))
+    return bytes(changed)
 
 
 def test_a_file_without_an_end_is_said_to_have_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
