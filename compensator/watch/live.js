@@ -143,7 +143,8 @@ async function showOne(prefix, count) {
 
 function joined(before, news, now_s) {
   if (!before || !news.t_s.length) return before && !news.t_s.length ? before : news;
-  const cut = before.t_s.findIndex((t) => t >= news.t_s[0] - 60), keep = cut < 0 ? before.t_s.length : cut;
+  // One point per minute: what was not sent again of a minute before stays, however few seconds before.
+  const cut = before.t_s.findIndex((t) => Math.floor(t / 60) >= Math.floor(news.t_s[0] / 60)), keep = cut < 0 ? before.t_s.length : cut;
   const oldest = now_s - DAY_S, first = before.t_s.findIndex((t) => t >= oldest);
   const from = first < 0 ? keep : Math.min(first, keep);
   return Object.fromEntries(Object.keys(news).map((name) => [name, [...(before[name] ?? before.t_s.map(() => null)).slice(from, keep), ...news[name]]]));

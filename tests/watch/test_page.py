@@ -14,13 +14,17 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from compensator.clock import NS
 from compensator.codes import WORDS
 from compensator.commands.watch import _token
 from compensator.errors import ServiceError, UsageError
+from compensator.messages import Offset
+from compensator.watch import server as server_module
 from compensator.watch.clients import CONNECTIONS
+from compensator.watch.history import MachineHistory
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
@@ -252,6 +256,34 @@ def test_a_page_goes_on_after_the_clock_of_the_watch_was_set_back(tmp_path: Path
         text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 400, budget_ms=12_000)
     assert console == "" and len(asked) > 6
     assert re.search(r'<table id="points".*<td>−22.22</td>', text, re.DOTALL) and "<td>−11.11</td>" not in text
+
+
+@pytest.mark.parametrize("past_minute_s", [0.0, 0.005, 30.0, 59.9])
+def test_a_page_that_stays_open_keeps_every_point(past_minute_s: float) -> None:
+    """The page's own code joins what `MachineHistory` answers to it, some times in each minute."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    history, answers, since_s, minutes = MachineHistory(), [], 0.0, 40
+    for i in range(minutes):
+        at_ns = START_NS + round((i * 60 + past_minute_s) * NS)
+        history.add(msgspec.json.decode(offset(i, at_ns), type=Offset), at_ns)
+        for later_s in (0.5, 20.0, 40.0):
+            now_s = at_ns / NS + later_s
+            found = history.columns(round(since_s * NS))
+            answers.append([found, now_s])
+            since_s = min(found["t_s"][-1], now_s) - 300.0
+    page = (Path(server_module.__file__).parent / "live.js").read_text(encoding="utf-8")
+    own = [
+        re.search(pattern, page, re.DOTALL | re.MULTILINE)
+        for pattern in (r"^const POLL_MS.*?;$", r"^function joined.*?^}")
+    ]
+    code = "\n".join(part[0] for part in own if part is not None) + (
+        "\nconst answers = JSON.parse(require('fs').readFileSync(0, 'utf-8'));"
+        "\nconsole.log(JSON.stringify(answers.reduce((past, one) => joined(past, ...one), null).y_offset_um.length));"
+    )
+    done = subprocess.run([node, "-e", code], input=json.dumps(answers), capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == minutes
 
 
 @pytest.mark.parametrize("part", ["word=%zz", "m=%zz"])
