@@ -97,6 +97,8 @@ class HeadKeeper:
         self.path, self._machine, self._signer = path, machine, signer
         #: Ends known, the newest last; replaced as a whole, so that another thread may read it.
         self.ends: tuple[End, ...] = ()
+        #: Time of the newest records that are covered, ns since 1970 UTC; 0 without a head.
+        self.time_utc_ns = 0
         #: Why there is no head; empty if there is one, or if none was written before.
         self.unusable = ""
         try:
@@ -106,7 +108,7 @@ class HeadKeeper:
             elif not signer.made(head.signed_bytes(), head.signature):
                 self.unusable = f"{path}: not signed with the key of this machine"
             else:
-                self.ends = tuple(head.ends)
+                self.ends, self.time_utc_ns = tuple(head.ends), head.time_utc_ns
         except UsageError as error:
             self.unusable = str(error) if os.path.lexists(path) else ""
 
@@ -133,7 +135,7 @@ class HeadKeeper:
             signature="",
         )
         head = msgspec.structs.replace(head, signature=self._signer.sign_bytes(head.signed_bytes()))
-        self.ends = ends
+        self.ends, self.time_utc_ns = ends, time_utc_ns
         replace_file(self.path, msgspec.json.encode(head), mode=0o640)
 
     def forget(self, file: str) -> None:

@@ -50,13 +50,18 @@ def first_sequence(
     period_s : float
         Length of a sample, s.
     keeper : HeadKeeper, optional
-        The head: only what is in its chain counts.
+        The head: what is in its chain counts, and of the rest what can have been published since it was written.
     remark : callable
         Called with file and text where a number cannot be one that was published.
     """
     since_s = (utc_ns - _EPOCH_2020_NS) / 1e9
     most = min(int(_PER_S * max(since_s, _LEAST_S)), SEQ_MAX // 2)
     last = last_sequence(folder, machine, most=most, keeper=keeper, remark=remark)
+    if keeper is not None and keeper.ends:
+        # A service whose head could not be written goes on. More samples than periods have passed it cannot have
+        # published, so whoever writes the folder gains nothing.
+        passed = max(utc_ns - keeper.time_utc_ns, 0) / 1e9 // period_s
+        last = max(last, last_sequence(folder, machine, most=min(most, last + int(passed) + 2)))
     return max(last + 1, int(since_s // period_s), 0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -113,6 +114,23 @@ def test_a_number_behind_the_head_is_not_taken(tmp_path: Path, seq: int) -> None
     assert first_sequence(shop.rec, MACHINE, START_NS, 60.0) == seq + 1
     # The group before is what the head states as written.
     assert shop.start().recorder.first_sequence(START_NS, 60.0) == PERIODS + 29
+
+
+def test_a_service_whose_head_could_not_be_written_has_published_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shop, ahead = Shop(tmp_path), 2 * PERIODS
+    service = shop.start(ahead)
+    service.start_ns = START_NS - ahead * MINUTE_NS  # the numbers are ahead, the clock is right
+    service.run(5)
+    with monkeypatch.context() as patched:
+        patched.setattr("compensator.recording.head.replace_file", Mock(side_effect=OSError(30, "read-only")))
+        service.run(50).kill()
+    later_ns = START_NS + 56 * MINUTE_NS
+    assert shop.start().recorder.first_sequence(later_ns, 60.0) == ahead + 55
+    # More than can have been published since then is none of its numbers.
+    rechained(shop.files[-1], lambda lines: [*lines[:-4], *renumbered(lines[-4:], ahead + 1000, ahead + 54)])
+    assert shop.start().recorder.first_sequence(later_ns, 60.0) == ahead + 54
 
 
 @pytest.mark.parametrize("way", ["newest rewritten", "newest removed", "newer added", "all rewritten"])
