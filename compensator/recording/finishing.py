@@ -189,6 +189,21 @@ class Finisher:
                 return place
         return 0
 
+    def _began(self, paths: Sequence[Path], now_ns: int) -> dict[Path, int]:
+        """Return when each recording began, ns since 1970 UTC: by its name, unless that is more than a day ahead.
+
+        After a start with the clock ahead the names of all later ones are ahead, too, as names are in order. Such a
+        one was not begun after it was last changed, nor after the next one was begun.
+        """
+        began, following = {}, now_ns
+        for path in reversed(paths):
+            began[path] = began_ns(path, self._machine)
+            if began[path] > now_ns + _DAY_NS:
+                with suppress(OSError):  # removed meanwhile
+                    began[path] = min(path.stat().st_mtime_ns, following)
+            following = min(following, began[path])
+        return began
+
     def _remove_oldest(self, now_ns: int, *, needs_room: bool) -> bool:
         """Remove files beyond the retention limit; return whether a file was removed.
 
@@ -199,7 +214,7 @@ class Finisher:
         if limits.keep_days is None and limits.keep_mb is None:
             return False
         paths = recordings(self._folder, self._machine)
-        began = {path: began_ns(path, self._machine) for path in paths}
+        began = self._began(paths, now_ns)
         today_ns = now_ns if needs_room else confirmed_ns(list(began.values()), now_ns)
         oldest_ns = -1 if limits.keep_days is None else today_ns - int(limits.keep_days * _DAY_NS)
         removed = []

@@ -19,7 +19,8 @@ from compensator.recording import compaction, finishing
 from compensator.recording.container import Contents
 from compensator.recording.finishing import Finisher, Retention, compact
 from compensator.recording.reading import read_messages, recordings
-from tests.audit.made import MACHINE, MINUTE_NS, Service
+from compensator.recording.recorder import McapRecorder
+from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import Line, end_of_chain, lines_of, rewrite
 from tests.service.simulated import START_NS
 
@@ -276,6 +277,32 @@ def test_a_clock_that_is_ahead_for_some_minutes_or_days_makes_no_recording_old(t
         service.recorder._finisher.wait()
     service.stop()
     assert len(recordings(tmp_path, MACHINE)) == 11 and service.recorder.remarks() == []
+
+
+@pytest.mark.parametrize("is_full", [False, True])
+def test_recordings_go_on_growing_old_after_a_start_with_the_clock_ahead(tmp_path: Path, is_full: bool) -> None:
+    """Names are in order, so those of all later ones are ahead, too."""
+    times: dict[Path, int] = {}
+    for day in (0, 1, 2, 733, *range(3, 45)):
+        at_ns = START_NS + day * DAY_NS
+        recorder = McapRecorder(tmp_path, MACHINE, {"config.toml": CONFIG})
+        recorder.write([("event", b"{}")], at_ns)
+        recorder.close()
+        assert recorder.path is not None
+        times[recorder.path] = at_ns
+    for path, at_ns in times.items():
+        os.utime(path, ns=(at_ns, at_ns))
+    assert sum("_20280108T" in path.name for path in times) == 43
+    finisher = Finisher(tmp_path, MACHINE, Retention(keep_days=10.0), None)
+    if is_full:
+        finisher.make_room(START_NS)  # a clock at its beginning makes nothing old
+        finisher.wait()
+        assert len(recordings(tmp_path, MACHINE)) == len(times)
+        finisher.make_room(START_NS + 45 * DAY_NS)
+    else:
+        finisher.enqueue(list(times)[-1], START_NS + 45 * DAY_NS)
+    finisher.wait()
+    assert recordings(tmp_path, MACHINE) == list(times)[-10:]
 
 
 def test_after_a_holiday_recordings_are_old_once_a_week_has_confirmed_the_clock(tmp_path: Path) -> None:
