@@ -18,6 +18,8 @@ STEP_NS = 60 * NS
 #: A point farther ahead of the watch's clock than this is dropped, ns: clocks differ by seconds or minutes, and points
 #: ahead would never be older than a day.
 AHEAD_NS = 300 * NS
+#: Most characters of the reasons of a point; what a stranger publishes is kept for a day.
+LONGEST_REASONS = 2000
 #: Shortest pause that separates two intervals in the same state, s.
 LEAST_PAUSE_S = 150.0
 #: Values of a point from the estimate and from the offset.
@@ -89,7 +91,7 @@ class MachineHistory:
             point["effects"] = message.y_effects_um
         else:
             point |= {name: getattr(message, name) for name in _OFFSET}
-            point["reasons"] = " ".join(message.reasons)
+            point["reasons"] = " ".join(message.reasons)[:LONGEST_REASONS]
 
     def add_candidate(self, status: Status) -> None:
         """Add the prediction of the model in shadow, which comes with the status of a sample."""

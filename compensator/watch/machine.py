@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from itertools import islice
 from typing import Any
 
 import msgspec
@@ -50,7 +51,13 @@ KINDS = {
 LONGEST = 2**20
 #: Events kept of each machine.
 EVENTS = 50
-#: Longest text of an event that is shown whole, characters; those of services are a few lines at most.
+#: Longest payload of an event whose data are kept as they are, bytes.
+EVENT_BYTES = 2**16
+#: Most effects of a model (`model/model_file.py`, which would bring NumPy with it).
+EFFECTS = 100
+#: Most reasons of an offset or a status: one for each channel that effects use, and those of the service.
+REASONS = EFFECTS + 50
+#: Longest text of an event that is kept and shown whole, characters; those of services are a few lines at most.
 TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
@@ -95,6 +102,10 @@ def decoded(kind: str, payload: bytes) -> Any:
         raise Malformed(f"{kind}: {error}") from error
     if message.schema != SCHEMA:
         raise Malformed(f"{kind}: schema = {message.schema}, expected {SCHEMA}")
+    for name, most in (("y_effects_um", EFFECTS), ("reasons", REASONS)):
+        count = len(getattr(message, name, ()))
+        if count > most:  # each of them would be kept for a day
+            raise Malformed(f"{kind}: {count} {name}, expected at most {most}")
     return message
 
 
@@ -165,6 +176,8 @@ class WatchedMachine:
             self.name, self.numbers = message.machine, Sequence()
         if isinstance(message, Offset):
             return self._update_offset(message, now_ns, monotonic_s, asked)
+        if isinstance(message, Event) and len(payload) > EVENT_BYTES:
+            message = _without_bulk(message)
         return self._update_other(message, now_ns, monotonic_s)
 
     def _update_offset(self, message: Offset, now_ns: int, monotonic_s: float, asked: bool) -> bool:
@@ -217,6 +230,8 @@ class WatchedMachine:
     ) -> bool:
         """Add a message other than an offset; messages older than the last are ignored."""
         if isinstance(message, Event):
+            kind, text = _shortened(message.kind), _shortened(message.text)
+            message = msgspec.structs.replace(message, kind=kind, text=text)
             if message in self.events:
                 return False
             self.events.append(message)
@@ -481,15 +496,22 @@ class WatchedMachine:
     def _event(self, event: Event) -> dict[str, Any]:
         return {
             "time_utc_ns": event.time_utc_ns,
-            "kind": _shortened(event.kind),
+            "kind": _shortened(event.kind),  # recorded ones are kept as they are
             "text": _shortened(event.text),
             "do": _shortened(to_do(event, self.config)),
         }
 
 
 def _shortened(text: str) -> str:
-    """Cut a text that no service writes: the page asks for all events every two seconds."""
+    """Cut a text that no service writes: it is kept, and the page asks for all events every two seconds."""
     return text if len(text) <= TEXT else f"{text[:TEXT]}…"
+
+
+def _without_bulk(event: Event) -> Event:
+    """Return an event that no service writes with the first texts of its data, cut, and nothing else of them."""
+    texts = ((name, text) for name, text in event.data.items() if isinstance(text, str) and len(name) <= 50)
+    data = {name: _shortened(text) for name, text in islice(texts, 20)}
+    return msgspec.structs.replace(event, machine=_shortened(event.machine), data=data)
 
 
 def _tone(shown: str, warnings: list[Remark]) -> Tone:

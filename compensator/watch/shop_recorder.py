@@ -33,8 +33,8 @@ log = logging.getLogger("compensator")
 
 #: Longest time from the arrival of a message until it is on disk, s.
 SYNC_S = 2.0
-#: Largest number of queued messages; beyond that the oldest are dropped and counted.
-WAITING = 200_000
+#: Largest number of queued messages, and of their bytes; beyond that the oldest are dropped and counted.
+WAITING, WAITING_BYTES = 200_000, 500_000_000
 #: Most messages that are written at once, so that a file is not much longer than full.
 PART = 10_000
 #: Largest number of channels in one file, so that arbitrary keys cannot fill the memory.
@@ -70,6 +70,7 @@ class ShopRecorder:
         self._folder, self._prefix, self._clock = folder, prefix, clock
         self._lock = threading.Lock()
         self._waiting: deque[_Arrival] = deque()
+        self._waiting_bytes = 0
         self._wake, self._ended = threading.Event(), False
         self._thread: threading.Thread | None = None
         self._finisher = Finisher(folder, NAME, Retention(), None, compacted=_compacted)
@@ -89,9 +90,14 @@ class ShopRecorder:
             return
         with self._lock:
             self._waiting.append(_Arrival(self._clock.utc_ns(), key, payload))
-            if len(self._waiting) > WAITING:
-                self._waiting.popleft()
-                self.not_recorded += 1
+            self._waiting_bytes += len(payload)
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """Drop what exceeds the memory for waiting messages, under the lock."""
+        while len(self._waiting) > WAITING or self._waiting_bytes > WAITING_BYTES:
+            self._waiting_bytes -= len(self._waiting.popleft().payload)
+            self.not_recorded += 1
 
     def set_alive(self, key: str, alive: bool) -> None:
         """Record a change of a liveliness token, as JSON under its key."""
@@ -158,6 +164,7 @@ class ShopRecorder:
         with self._lock:
             batch = list(self._waiting)
             self._waiting.clear()
+            self._waiting_bytes = 0
         try:
             self._write(batch)
         except OSError as error:
@@ -225,9 +232,9 @@ class ShopRecorder:
             self._failed = True
             log.error("compensator: the shop's recording cannot be written: %s", error)
         with self._lock:
-            room = max(WAITING - len(self._waiting), 0)
-            self.not_recorded += max(len(batch) - room, 0)
-            self._waiting.extendleft(reversed(batch[len(batch) - room :] if room else []))
+            self._waiting.extendleft(reversed(batch))
+            self._waiting_bytes += sum(len(arrival.payload) for arrival in batch)
+            self._drop_oldest()
 
     def _finish(self) -> None:
         file, self._file = self._file, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from compensator.clock import NS
 from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import AxesEstimate
+from compensator.model.model_file import EFFECTS
 from compensator.watch import past
 from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
@@ -156,6 +158,30 @@ def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload
     assert after["to_do"].startswith("1 malformed") and after["to_do"].endswith(
         "which programs publish below the prefix."
     )
+
+
+@pytest.mark.parametrize(
+    "message",
+    [{"estimate": estimate(6, effects=(1.5,) * (EFFECTS + 1))}, {"offset": offset(6, reasons=["cold_start"] * 200)}],
+)
+def test_more_than_any_service_has_is_no_message(heard: Heard, message: dict[str, bytes]) -> None:
+    heard.hear(offset=offset(5), estimate=estimate(5, effects=(1.5,) * EFFECTS))
+    heard.hear(**message)
+    assert (heard.machine["malformed"], heard.machine["seq"], len(heard.machine["shares"])) == (1, 5, EFFECTS + 2)
+
+
+def test_what_strangers_publish_is_not_kept_for_a_day(heard: Heard) -> None:
+    """Memory of a machine is bounded by its number of points and events, not by the length of a message."""
+    tracemalloc.start()
+    for i in range(60):
+        t = START_NS - i * 60 * NS
+        heard.hear(
+            offset=offset(i, t, reasons=["x" * 400_000]), event=event(i, t, "x" * 9_000, "y" * 9_000, z="z" * 9**6)
+        )
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert kept < 3_000_000 and len(heard.machine["events"]) == 50
+    assert len(heard.shop.history("shop/vmc-07")["reasons"][0]) == 2000
 
 
 def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -> None:

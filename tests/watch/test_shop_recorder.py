@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from mcap.reader import make_reader
@@ -187,8 +188,11 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch
     assert recorder.not_recorded == 0 and recorder.messages == 2
 
 
-def test_what_does_not_fit_into_memory_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shop_recorder, "WAITING", 3)
+@pytest.mark.parametrize(("limit", "most"), [("WAITING", 3), ("WAITING_BYTES", 3 * len(offset(0)))])
+def test_what_does_not_fit_into_memory_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
+) -> None:
+    monkeypatch.setattr(shop_recorder, limit, most)
     recorder = ShopRecorder(tmp_path, "shop", Clock())
     for number in range(5):
         recorder.receive(KEY + "y/offset", offset(number))
@@ -196,6 +200,22 @@ def test_what_does_not_fit_into_memory_is_counted(tmp_path: Path, monkeypatch: p
         pass
     assert recorder.not_recorded == 2 and [one[2] for one in read(recordings(tmp_path)[0])] == [2, 3, 4]
     assert recorder.answer()[0]["not_recorded"] == 2
+
+
+@pytest.mark.parametrize(("limit", "most"), [("WAITING", 3), ("WAITING_BYTES", 3 * len(offset(0)))])
+def test_what_a_full_disk_gives_back_does_not_exceed_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
+) -> None:
+    monkeypatch.setattr(shop_recorder, limit, most)
+    recorder = ShopRecorder(tmp_path, "shop", Clock())
+    with monkeypatch.context() as full:
+        full.setattr(shop_recorder._File, "sync", Mock(side_effect=OSError(28, "No space left on device")))
+        for number in range(5):
+            recorder.receive(KEY + "y/offset", offset(number))
+            assert not recorder._write_waiting()
+    with recorder:
+        pass
+    assert recorder.not_recorded == 2 and [one[2] for one in read(recordings(tmp_path)[0])] == [2, 3, 4]
 
 
 def test_damage_leaves_the_file_as_it_was(tmp_path: Path) -> None:
