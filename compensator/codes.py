@@ -855,6 +855,12 @@ class ProbeSourceRemark(Code):
         "The time in the line is not the time at which it arrived: it is late, or the control's clock is wrong.",
         "Set the control's clock and the key `zone`; probe again.",
     )
+    LINE_AHEAD = (
+        "line_ahead",
+        "A line of a CSV file has a time that this computer's clock has not reached yet; it waits in its file.",
+        "Nothing if this computer has just started; else check the time service (NTP) of whoever wrote it and of this "
+        "computer.",
+    )
     LINE_OFFSET_UNKNOWN = (
         "line_offset_unknown",
         "The offset that acted at the touch is neither in the line nor in the receiver's record.",

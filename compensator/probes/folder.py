@@ -21,6 +21,8 @@ from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
 LONGEST = 10_000_000
+#: A line whose time is farther ahead of this computer's clock than this waits in its file, ns.
+AHEAD_NS = 5_000_000_000
 #: So many lines and files are read before the other sources have their turn.
 READ_AT_ONCE = 200
 
@@ -80,6 +82,8 @@ class WatchedFolder:
         self._reading: Iterator[None] = iter(())
         self._seen: dict[Path, _Signature] = {}
         self._read: dict[Path, _Signature] = {}
+        #: Files with lines that are ahead of the clock here, and when the first of them no longer is.
+        self._ahead: dict[Path, int] = {}
         self._pending: dict[str, str] = {}
         self._reported: set[tuple[Path, str]] = set()
 
@@ -102,6 +106,9 @@ class WatchedFolder:
         """
         self.keep()
         found = dict(self._files())
+        for path in [path for path, due_ns in self._ahead.items() if self._utc_ns() >= due_ns or path not in found]:
+            del self._ahead[path]
+            self._read.pop(path, None)
         for path, signature in found.items():
             if self._read.get(path) != signature and self._seen.get(path) == signature:
                 self._read[path] = signature
@@ -177,6 +184,8 @@ class WatchedFolder:
         if old:
             why = f"{old} line(s) older than {duration(self._send_within_ns / 1e9)}"
             self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
+        if path in self._ahead:
+            self._refuse(path, ProbeSourceRemark.LINE_AHEAD, "", "line(s) ahead of this computer's clock wait")
 
     def _handle(self, path: Path, names: list[str], text: str) -> bool:
         """Submit a line that is new; return whether it was not because it is too old."""
@@ -193,8 +202,13 @@ class WatchedFolder:
             if before != line.values:
                 self._refuse(path, ProbeSourceRemark.LINE_CHANGED, text, "sent before with other values")
             return False
-        if self._utc_ns() - line.time_utc_ns > self._send_within_ns:
+        age_ns = self._utc_ns() - line.time_utc_ns
+        if age_ns > self._send_within_ns:
             return True
+        if age_ns < -AHEAD_NS:
+            # As until NTP has set the clock here after a boot: the service would refuse the probe for good.
+            self._ahead[path] = min(self._ahead.get(path, line.time_utc_ns), line.time_utc_ns - AHEAD_NS)
+            return False
         offset_um = line.offset_applied_um
         if offset_um is None:
             offset_um = self._applied_at(line.time_utc_ns)

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
@@ -100,6 +101,40 @@ def test_a_line_becomes_a_probe_with_its_own_time(tmp_path: Path) -> None:
         )
     ]
     assert not bench.reports
+
+
+def test_a_line_ahead_of_the_clock_waits_until_the_clock_is_set(tmp_path: Path) -> None:
+    """The service would refuse it as of the future, and what was handled is not sent again."""
+    bench = Bench(tmp_path)
+    bench.minute = -30.0
+    bench.write(HEADER + line(1.0) + line(1.5) + line(300.0))
+    bench.restart()
+    bench.look()
+    assert not bench.probes and ["[line_ahead]" in report for report in bench.reports] == [True, True]
+    bench.minute = 2.0
+    bench.look()
+    bench.look()
+    assert bench.minutes == [1.0, 1.5] and len(bench.reports) == 2
+    bench.minute = 300.0
+    bench.look()
+    assert bench.minutes == [1.0, 1.5, 300.0]
+
+
+def test_a_file_whose_lines_wait_is_not_read_before_they_are_due(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path)
+    bench.write(HEADER + line(300.0))
+    read = Mock()
+    monkeypatch.setattr("compensator.probes.folder.read_file", read)
+    bench.look()
+    assert not read.called
+
+
+def test_a_line_a_little_ahead_is_sent(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.write(HEADER + line(2.05))
+    assert bench.minutes == [2.05] and not bench.reports
 
 
 def test_a_pattern_that_python_does_not_take_is_said_once_and_ends_nothing(tmp_path: Path) -> None:
@@ -328,7 +363,8 @@ def test_a_long_file_is_read_as_there_is_room_and_the_state_written_once_a_look(
 
     monkeypatch.setattr(Handled, "write", counted)
     bench = Bench(tmp_path)
-    room = [100]
+    room, bench.minute = [100], 120.0
+    monkeypatch.setattr(bench.watched, "_send_within_ns", 7200 * 10**9)
     monkeypatch.setattr(bench.watched, "_has_room", lambda: len(bench.probes) < room[0])
     (bench.folder / "a.csv").write_text(HEADER + "".join(line(k / 1000.0) for k in range(0, 120000, 60)))
     bench.look()
