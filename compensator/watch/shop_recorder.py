@@ -180,9 +180,10 @@ class ShopRecorder:
             if self._file is None or day != self._day or self._file.is_full:
                 self._finish()
                 self._file, self._day = _File(self._folder, part[0].time_ns, self._prefix), day
-                self.files.append(self._file.path)
             written = sum([self._file.add(arrival, self._numbered(arrival)) for arrival in part])
             self._file.sync()
+            if self.files[-1:] != [self._file.path]:  # one that is given up before that is removed
+                self.files.append(self._file.path)
             self.messages += written
             self.not_recorded += len(part) - written
             del batch[: len(part)]

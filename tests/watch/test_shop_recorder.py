@@ -216,6 +216,7 @@ def test_what_a_full_disk_gives_back_does_not_exceed_the_memory(
     with recorder:
         pass
     assert recorder.not_recorded == 2 and [one[2] for one in read(recordings(tmp_path)[0])] == [2, 3, 4]
+    assert recorder.files == recordings(tmp_path)  # those that were given up are not there
 
 
 def test_damage_leaves_the_file_as_it_was(tmp_path: Path) -> None:
