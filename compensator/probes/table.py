@@ -111,7 +111,7 @@ def row(names: list[str], line: str) -> Row:
     if len(fields) != len(names):
         raise BadLine(f"{len(fields)} values, expected {len(names)}")
     values = dict(zip(names, (field.strip() for field in fields), strict=True))
-    if values.get("axis", "y") != "y":
+    if (values.get("axis") or "y") != "y":
         raise BadLine(f"axis = {values['axis']!r}, expected y")
     measured_um = _number(values, "measured_um", -LARGEST_UM, LARGEST_UM)
     if measured_um is None:

@@ -276,6 +276,10 @@ NAMES = columns("\ufefftime_utc, axis,measured_um,offset_applied_um,std_um,featu
 GOOD = "2026-03-02T10:00:00Z,y,3.2,-12.3,1.5,sphere-1,probe,20"
 
 
+def test_an_axis_that_is_not_given_is_y() -> None:
+    assert row(NAMES, GOOD.replace(",y,", ",,")) == row(NAMES, GOOD)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
