@@ -163,7 +163,7 @@ class Comparison:
         rows = self.rows()
         width = max(map(len, rows))
         lines = [
-            f"{self.samples} samples; y_um was measured in {self.residual_before.samples} of them",
+            f"{self.samples} samples; {self.residual_before.samples} of them have a residual with both models",
             f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at",
         ]
         for name, spread in rows.items():

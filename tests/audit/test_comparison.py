@@ -82,6 +82,7 @@ def test_the_figures_are_those_of_a_plain_loop(tmp_path: Path) -> None:
     assert [row[6] for row in rows] == [repr(float(value)) for value in would]
     assert rows[60][2] == "" and rows[60][4] == ""  # what is missing is empty
     text = found.text()
+    assert text.startswith("120 samples; 105 of them have a residual with both models\n")
     assert f"{found.residual_after.rms:.3f}" in text and "other" in text and "quill (recorded)" in text
 
 
