@@ -143,7 +143,11 @@ class EstimateMessage(Message, frozen=True, kw_only=True):
     y_dtf_um, y_tdtf_um, y_effects_um
         Share of each path and effect, µm.
     y_base_um : float
-        Predicted deformation at the last zero on a warm machine, µm; it is subtracted from the sum of the shares.
+        Predicted deformation at the last zero on a warm machine, less `level_um`, µm; it is subtracted from the sum of
+        the shares.
+    level_um : float, optional
+        By how much the prediction was raised since the zero, to the level of measured Y, as the loop adopted the
+        model, µm; only if it was.
     y_pred_um, y_std_um : float or None
         Predicted deformation since the zero and its standard deviation, µm.
     y_rate_um_per_min : float or None
@@ -163,6 +167,7 @@ class EstimateMessage(Message, frozen=True, kw_only=True):
     y_tdtf_um: Number | None
     y_effects_um: list[Number]
     y_base_um: Number
+    level_um: Number | UnsetType = UNSET
     y_pred_um: Number | None
     y_std_um: Number | None
     y_rate_um_per_min: Number | None

@@ -302,10 +302,9 @@ class _Run:
         zero = any(event.kind == EventKind.ZERO for event in step.events)
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:
             return
-        y_ref_um = math.nan if estimate.y_base_um != 0.0 else number(estimate.y_ref_um)
-        compensation.begin(
-            msgspec.structs.replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0, further={})
-        )
+        recorded = Zero.of_estimate(estimate)
+        y_ref_um = math.nan if recorded.y_base_um != 0.0 else recorded.y_ref_um
+        compensation.begin(msgspec.structs.replace(recorded, y_ref_um=y_ref_um, y_base_um=0.0, further={}))
         figures = (
             f"{step.file}: starts while the machine is running, and the other model has no state except the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."

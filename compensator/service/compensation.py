@@ -305,7 +305,7 @@ class Compensation(Continuity):
             self._engine.set_reference(values.t_q, values.at)
             self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
             zero.y_base, self._memory.cold_min = 0.0, 0.0
-        zero.y_ref, zero.wanted = values.y, False
+        zero.y_ref, zero.level, zero.wanted = values.y, 0.0, False
         self.outputs.set_zero(self._memory.estimate if warm else None, values.others)
         self.plausibility.reset(at_rest=not warm)
         self._jumps.set_zero(self._memory.estimate if warm else None, values.y)

@@ -307,6 +307,12 @@ class Continuity:
     def raise_level(self, um: float) -> None:
         """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""
         self._zero.y_base -= um
+        self._zero.level += um
+
+    @property
+    def level_um(self) -> float:
+        """By how much the predicted deformation was raised since the zero, µm."""
+        return self._zero.level
 
 
 def slowest_min(model: ThermalModel) -> float:

@@ -112,6 +112,7 @@ def estimate_message(
         y_tdtf_um=estimate.y_tdtf_um if estimate else NAN,
         y_effects_um=list(estimate.y_effects_um) if estimate else [],
         y_base_um=zero.y_base,
+        level_um=zero.level or UNSET,
         y_pred_um=prediction.y_um,
         y_std_um=prediction.std_um,
         y_rate_um_per_min=prediction.rate_um_per_min,

@@ -43,7 +43,9 @@ class ZeroState:
     y_ref : float
         Measured deformation at the zero, µm.
     y_base : float
-        Predicted deformation at the last zero on a warm machine, µm.
+        Predicted deformation at the last zero on a warm machine less `level`, µm.
+    level : float
+        By how much the predicted deformation was raised since the zero, µm; omitted if it was not.
     wanted : bool
         Whether a zero was requested and waits for both temperatures.
     mode : {"auto", "rest", "warm"}
@@ -52,6 +54,7 @@ class ZeroState:
 
     y_ref: float = NAN
     y_base: Number = 0.0
+    level: Number = 0.0
     wanted: bool = False
     mode: ZeroMode = "auto"
 
@@ -146,6 +149,8 @@ def frozen_state(state: CompensationState) -> Callable[[], bytes]:
     for name in ("plausibility", "probing", "jumps", "axes"):
         if table[name] is None:
             del table[name]
+    if not table["zero"]["level"]:
+        del table["zero"]["level"]
     # As in versions that knew Y alone.
     jumps = list(_jumps_of(table.get("jumps")))
     branches = [jump[name] for jump in jumps for name in ("believing", "shifted") if jump[name] is not None]

@@ -27,7 +27,7 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
     t_q_shift_k, at_shift_k : float
         By how much the sensors show more than those that the model was made with, K.
     y_base_um : float
-        Predicted deformation at the last zero on a warm machine, µm.
+        Predicted deformation at the last zero on a warm machine, µm; without a level to which a model was raised since.
     further : mapping of str to float
         Predicted value of each further output at that zero by its name, in its unit.
     """
@@ -47,7 +47,7 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
             t_q_ref_degc=number(estimate.t_q_ref_degc),
             at_ref_degc=number(estimate.at_ref_degc),
             y_ref_um=number(estimate.y_ref_um),
-            y_base_um=estimate.y_base_um,
+            y_base_um=estimate.y_base_um + (estimate.level_um or 0.0),
             t_q_shift_k=estimate.t_q_shift_k or 0.0,
             at_shift_k=estimate.at_shift_k or 0.0,
             further=further_bases(estimate) if isinstance(estimate, AxesEstimate) else {},
@@ -67,7 +67,7 @@ class Zero(msgspec.Struct, frozen=True, kw_only=True):
             t_q_ref_degc=reference.t_q_degc,
             at_ref_degc=reference.at_degc,
             y_ref_um=zero.y_ref,
-            y_base_um=zero.y_base,
+            y_base_um=zero.y_base + zero.level,
             t_q_shift_k=shifted_k[0],
             at_shift_k=shifted_k[1],
             further={name: one.base for name, one in axes.items()},

@@ -7,6 +7,7 @@ a zero.
 import asyncio
 import dataclasses
 import json
+import shutil
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from compensator.audit.result import RecordingAudit
 from compensator.config import Loop
 from compensator.errors import DataError
 from compensator.events import ComparisonVerdict
+from compensator.model.model_file import parse_model
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
 from compensator.service.loop import loop as loop_module
@@ -28,6 +30,8 @@ from compensator.service.loop.weighing import Diagnosed, without_candidate
 from compensator.service.replay import opening_of
 from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.second_opinion import second_opinion
+from compensator.service.transfer.warm_up import warm_up
 from tests.service.living import MACHINE
 from tests.service.looping import (
     DAY,
@@ -370,3 +374,35 @@ def test_that_an_effect_began_is_seen_in_what_older_parameters_left_before_the_r
     assert compared.shown_level_um is None
     compared.go_on_with(before, now * BLOCK_NS)
     assert compared.shown_level_um == 6.0
+
+
+def kept(service, folder, last):
+    """Copy the last recordings of a service."""
+    folder.mkdir()
+    for path in recordings(service.recordings, MACHINE)[-last:]:
+        shutil.copy(path, folder)
+    return folder
+
+
+@pytest.mark.parametrize("last", [99, 1])
+def test_a_warm_up_of_the_adopted_model_has_its_level_and_no_other_model_has_it(adopted, tmp_path, last):
+    """As at a restart with another configuration; also where the zero is not on record any longer."""
+    folder, level_um = kept(adopted, tmp_path / "kept", last), adopted.events("adopt")[-1].data["level_um"]
+    own, other = (
+        warm_up(folder, adopted.config, parse_model(data, source="test")).compensation
+        for data in (extended(), QUILL_FILE)
+    )
+    estimate = adopted.outcomes[-1].estimate
+    assert own.level_um == estimate.level_um == level_um and other.level_um == 0.0
+    zero = own.status.zero
+    assert zero is not None and zero.y_base_um == pytest.approx(0.0, abs=1e-9)
+    assert other.status.zero is not None and other.status.zero.y_base_um == pytest.approx(0.0, abs=1e-9)
+    if last > 1:
+        assert own.status.target_um == pytest.approx(-estimate.y_pred_um, abs=0.2)
+
+
+def test_by_how_much_the_offset_would_move_counts_from_the_level_of_the_present_model(adopted):
+    models = [parse_model(data, source="test") for data in (extended(), QUILL_FILE)]
+    found = second_opinion(adopted.recordings, adopted.config, *models)
+    present_um, before_um = adopted.outcomes[-1].estimate.y_pred_um, adopted.candidates()[-1].y_pred_um
+    assert found.offset_change_um == pytest.approx(present_um - before_um, abs=0.5)

@@ -185,10 +185,12 @@ def _run(
             begun = True
             for run in runs:
                 run.compensation.begin(zero)
-        if step.zero is not None:
+        levels_um = [run.compensation.level_um for run in runs]
+        outcomes = [outcome for run in runs if (outcome := run.process(step)) is not None]
+        # What a model left before its level was raised is not comparable either.
+        if step.zero is not None or levels_um != [run.compensation.level_um for run in runs]:
             for comparison in found.values():
                 comparison.set_zero()
-        outcomes = [outcome for run in runs if (outcome := run.process(step)) is not None]
         if len(outcomes) == len(runs) and outcomes[0].sample.time_utc_ns > from_ns:
             _compare(found, step, outcomes[0], outcomes[1])
     present, candidate = (run.compensation for run in runs)

@@ -169,6 +169,8 @@ class RecordedRun:
             As in `FreeRun.run`.
         """
         if step.sample is not None:
+            with suppress(DataError):
+                self._take_level(step)
             if step.zero is not None:
                 self.compensation.zero(step.zero)
             channels = {name: channel for name, channel in step.sample.channels.items() if name in self.channels}
@@ -189,6 +191,15 @@ class RecordedRun:
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
+
+    def _take_level(self, step: RecordedStep) -> None:
+        """Take the level at which the loop had adopted this very model, where the model was in force."""
+        offset, estimate = step.offset, step.estimate
+        if offset is None or estimate is None or offset.model_sha256 != self.compensation.model.sha256:
+            return
+        raised_um = (estimate.level_um or 0.0) - self.compensation.level_um
+        if raised_um:
+            self.compensation.raise_level(raised_um)
 
 
 def _is_resume(event: Event) -> bool:
