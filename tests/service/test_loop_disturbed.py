@@ -116,7 +116,7 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
         whole | {model: extended(2.0)},
         whole | {state: whole[state][:-20]},
         whole | {LOOP_STATE: whole[LOOP_STATE][:-20]},
-        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":8', b'{"schema":7')},
+        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":9', b'{"schema":8')},
     ):
         with pytest.raises(CompensatorError):
             ModelLoop(settings(), present.model, damaged)

@@ -71,6 +71,20 @@ def test_the_level_is_what_measured_y_shows_since_the_effect_began():
     assert abs(np.mean(after)) < 1.0 and np.std(after) < 1.0
 
 
+def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero_before():
+    """The model is stored meanwhile, or the service was killed."""
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    samples = machine(3 * DAY, begun, change=warm_at_first)
+    while not loop._core.state.exchange:
+        loop.process(next(samples))
+    assert abs(loop._core.state.level_um) == pytest.approx(12.0, abs=1.0)
+    loop.compensation.zero("warm")
+    loop._core.process(loop.compensation.process(next(samples)))
+    steps = run(loop, samples, 120)
+    assert steps[-1].model_sha256 == sha256_of(extended())
+    assert abs(np.mean(errors(steps)[60:])) < 2.0
+
+
 @pytest.mark.parametrize("slip_min", [60, 300])
 def test_a_mount_that_slips_beside_an_effect_that_acts_is_no_level_of_it(slip_min):
     """The effect acts all the time, and the mount slips by 8 µm: the level of the candidate is right, that of Y not."""

@@ -137,6 +137,7 @@ class Loop:
         state.error.update(present)
         if sets_zero(present):
             state.zero_utc_ns, state.y_moved_ns, state.zero_channels = now_ns, 0, channels_at_zero(present)
+            state.level_um = 0.0  # that of a decided exchange is one about the zero before
         notes = self._forget_wrong() if was_wrong(present) else []
         notes += self._wait(present, others, is_suspected=suspected)
         judged: list[Place] = []

@@ -15,7 +15,7 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.transfer.comparison import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 8
+STATE_SCHEMA = 9
 
 #: A candidate may be adopted; to a model from before, or with fewer effects, the service goes back.
 Role = Literal["candidate", "before"]
