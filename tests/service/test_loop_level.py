@@ -21,6 +21,7 @@ from compensator.events import ComparisonVerdict
 from compensator.model.model_file import parse_model
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
+from compensator.service.compensation import Compensation
 from compensator.service.loop import loop as loop_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero
@@ -83,6 +84,20 @@ def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero
     steps = run(loop, samples, 120)
     assert steps[-1].model_sha256 == sha256_of(extended())
     assert abs(np.mean(errors(steps)[60:])) < 2.0
+
+
+def test_what_a_model_leaves_while_its_state_is_not_known_is_none_of_its_errors():
+    """A warm-up that begins with an unknown state errs for hours: a slip since then would look like an effect's level."""
+    error, compensation = ErrorBlocks(), Compensation(settings(), parse_model(QUILL_FILE, source="test"))
+    outcomes = []
+    for i, sample in enumerate(machine(300, lambda i: 0.0)):
+        if i == 100:
+            compensation.pause(None)
+        outcomes.append(compensation.process(sample))
+        error.update(outcomes[-1])
+    known = {one.sample.time_utc_ns // BLOCK_NS for one in outcomes[:100]}
+    assert np.ptp([one.estimate.residual_um for one in outcomes[100:]]) > 5.0
+    assert {number for number, _ in error.blocks} == known
 
 
 @pytest.mark.parametrize("slip_min", [60, 300])

@@ -23,6 +23,7 @@ from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero, sets_zero_at_rest
 from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.evidence import FLOOR_UM
+from compensator.service.transfer.second_opinion import is_unusable
 
 #: The present model was right before if it erred by less than `QUIET` of what it errs by since then, and its error
 #: changed by less than this part of what the candidate's changed by.
@@ -59,7 +60,7 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
     sum_um: float = 0.0
 
     def update(self, outcome: Outcome) -> None:
-        """Add a sample of the model, unless it shows a fault by itself."""
+        """Add a sample of the model, unless it shows a fault by itself, or the model's state is not known."""
         if sets_zero(outcome):
             self.clear()
         residual_um, block = number(outcome.estimate.residual_um), outcome.sample.time_utc_ns // BLOCK_NS
@@ -67,7 +68,7 @@ class ErrorBlocks(msgspec.Struct, kw_only=True):
             if self.count:
                 self.blocks = [*self.blocks, (self.number, self.sum_um / self.count)][-_BLOCKS:]
             self.number, self.count, self.sum_um = block, 0, 0.0
-        if np.isfinite(residual_um) and not is_disturbed(outcome.offset.reasons):
+        if np.isfinite(residual_um) and not (is_disturbed(outcome.offset.reasons) or is_unusable(outcome)):
             self.count, self.sum_um = self.count + 1, self.sum_um + residual_um
 
     def go_on_after(self, before: ErrorBlocks) -> None:
