@@ -100,12 +100,13 @@ class Compensation(Continuity):
             if self._engine.has_reference:
                 self._pass_cold(self._cold_samples)
 
-    def believe_wires(self, reasons: Sequence[str]) -> None:
+    def believe_as_in_force(self, reasons: Sequence[str]) -> None:
         """Believe that T_Q and AT are right again where the model in force does, whose reasons of a sample are given.
 
-        Where its state was unknown then a person has seen to the wires; else measured Y has shown it, maybe not yet by
-        this model.
+        Where its state was unknown after exchanged wires a person has seen to them; else measured Y has shown it, maybe
+        not yet by this model. A channel that has jumped is believed only if both models have suspected it.
         """
+        self._use(self._jumps.follow(self._engine, reasons))
         if self.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in reasons:
             if Reason.COLD_START in reasons:
                 self.resume()
@@ -114,7 +115,10 @@ class Compensation(Continuity):
 
     def _release(self, *, new_zero: bool) -> None:
         """Use channels again that have jumped."""
-        found = self._jumps.release(self._engine, self._memory.estimate, new_zero=new_zero)
+        self._use(self._jumps.release(self._engine, self._memory.estimate, new_zero=new_zero))
+
+    def _use(self, found: Judgement) -> None:
+        """Go on from what was judged between two samples."""
         self._follow(found)
         if found.estimate is not None:
             self._memory.estimate = found.estimate

@@ -153,6 +153,9 @@ def frozen_state(state: CompensationState) -> Callable[[], bytes]:
         del table["zero"]["level"]
     # As in versions that knew Y alone.
     jumps = list(_jumps_of(table.get("jumps")))
+    for jump in jumps:
+        if not jump["in_force"]:
+            del jump["in_force"]
     branches = [jump[name] for jump in jumps for name in ("believing", "shifted") if jump[name] is not None]
     estimates = [table["memory"]["estimate"], *(jump["zero_in_use"] for jump in jumps)]
     estimates += [branch[name] for branch in branches for name in ("estimate", "at_zero")]

@@ -16,6 +16,8 @@ from compensator.errors import DataError
 from compensator.messages import Offset, ProbeRequest, encode, number
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.probing import ReceivedProbe
+from compensator.service.transfer.shadow import Shadow
+from compensator.service.transfer.warm_up import Successor
 from tests.service.jumping import (
     BEGIN,
     CHANNELS,
@@ -261,6 +263,77 @@ def test_probes_while_the_offset_is_held_speak_against_a_sensor_that_is_wrong(
     outcomes = probed_day(day, hourly, fault_k=fault_k)
     assert [p.code for o in outcomes for p in o.probes].count("probe_during_hold") >= 2
     assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[BEGIN + 2 :])
+
+
+def again(compensation: Compensation) -> Compensation:
+    """Return what goes on from the state of a compensation."""
+    restored = Compensation(compensation._config, compensation.model)
+    restored.restore(compensation.state())
+    return restored
+
+
+def test_what_probes_during_a_hold_have_shown_reaches_other_models(day: dict[str, np.ndarray]) -> None:
+    """In shadow, and without the probes as `adopt` warms up; T_Q is doubted there, too, and right."""
+    hourly = {30: 0.0, 90: 0.0, 150: 0.0, 210: 0.0}
+    outcomes = probed_day(day, hourly, rate_max=0.5)
+    probe = Probe(std_um=1.0, measured_max_um=200.0, largest_um=40.0, tolerance_um=3.0)
+    channels = [c | {"rate_max_per_min": 0.5} if c["name"] == "t_q_degc" else c for c in CHANNELS]
+    conf = msgspec.structs.replace(settings(channel=channels), probe=probe)
+    shadow, warmed = (Shadow(Compensation(conf, QUILL), b"") for _ in range(2))
+    followed = []
+    for outcome in outcomes:
+        if outcome.sample.seq == 120:
+            warmed.compensation = again(warmed.compensation)  # a file begins
+        followed.append((shadow.process(outcome)[1], warmed.process(msgspec.structs.replace(outcome, probes=()))[1]))
+    for others in zip(*followed, strict=True):
+        assert others[140].offset.state == "hold"
+        assert {o.offset.state for o in others[155:260]} == {"degraded"}
+        assert all("unconfirmed_channel:t_q_degc" in o.offset.reasons for o in others[155:260])
+        assert np.max(np.abs(offsets(list(others)) - undisturbed()[:END])[160:260]) < 5.0
+
+
+def test_a_resume_while_a_model_is_prepared_reaches_it(day: dict[str, np.ndarray]) -> None:
+    present, other = (Compensation(settings(), QUILL) for _ in range(2))
+    successor = Successor(compensation=other)
+    for i in range(BEGIN + 40):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += 3.0 if i >= BEGIN else 0.0
+        if i == BEGIN + 20:
+            present.resume()
+        successor.follow(present.process(sample(i, values)))
+        if i == BEGIN + 19:
+            assert present._jumps.suspects == other._jumps.suspects == ("t_q_degc",)
+    assert present._jumps.suspects == other._jumps.suspects == ()
+    assert other.status.target_um == pytest.approx(present.status.target_um, abs=0.5)
+
+
+@pytest.mark.parametrize("often", [1, 2])
+def test_a_channel_that_returns_is_not_believed_because_the_model_in_force_uses_it(
+    day: dict[str, np.ndarray], often: int
+) -> None:
+    """The other model has seen it jump more often, and waits for longer; what T_Q showed was wrong."""
+    present, shadow = Compensation(settings(), QUILL), Shadow(Compensation(settings(), QUILL), b"")
+    outcomes, followed = [], []
+    for i in range(len(undisturbed())):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += 8.0 if BEGIN <= i < BEGIN + 40 else 0.0
+        outcomes.append(present.process(sample(i, values)))
+        followed.append(shadow.process(outcomes[-1])[1])
+        if i == BEGIN + 2:
+            shadow.compensation._jumps._jump.state.again = {"t_q_degc": often}
+    assert outcomes[BEGIN + 43].offset.state == "ok"
+    assert "suspect_channel:t_q_degc" in followed[BEGIN + 43].offset.reasons
+    assert not is_wrong_in_ok(followed)
+
+
+def test_a_doubt_that_the_model_in_force_never_had_stays(day: dict[str, np.ndarray]) -> None:
+    compensation = Compensation(settings(), QUILL)
+    for i in range(BEGIN + 20):
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += 3.0 if i >= BEGIN else 0.0
+        compensation.process(sample(i, values))
+        compensation.believe_as_in_force([])
+    assert compensation._jumps.suspects == ("t_q_degc",)
 
 
 @pytest.mark.parametrize("samples", [1, 2])

@@ -87,7 +87,7 @@ def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero
 
 
 def test_what_a_model_leaves_while_its_state_is_not_known_is_none_of_its_errors():
-    """A warm-up that begins with an unknown state errs for hours: a slip since then would look like an effect's level."""
+    """A warm-up that begins with one errs for hours: a slip since then would look like an effect's level."""
     error, compensation = ErrorBlocks(), Compensation(settings(), parse_model(QUILL_FILE, source="test"))
     outcomes = []
     for i, sample in enumerate(machine(300, lambda i: 0.0)):

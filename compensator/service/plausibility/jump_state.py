@@ -138,6 +138,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Whether suspect channels were wrong before their jump; of the watch as a whole.
     learning : int
         Samples for which Y goes on to correct what they have left in the state; of the watch as a whole.
+    in_force : bool
+        Whether the model in force suspects them, too, beside which this one runs; omitted if not.
     """
 
     level_um: float = NAN
@@ -174,6 +176,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     beside: JumpState | None = None
     hindsight: HindsightState | None = None
     learning: Count = 0
+    in_force: bool = False
 
     @property
     def is_suspect(self) -> bool:

@@ -8,12 +8,12 @@ this folder.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
 from compensator.arrays import NAN
-from compensator.codes import SampleQuality
+from compensator.codes import Reason, SampleQuality
 from compensator.config import Config
 from compensator.events import Implausibility
 from compensator.messages import ChannelSample, number
@@ -163,6 +163,31 @@ class JumpWatch:
         """
         before = self._before()
         found = self._jump.release(engine, used, new_zero=new_zero)
+        self._end_hindsight()
+        self._forget(*before)
+        return found
+
+    def follow(self, engine: Engine, reasons: Sequence[str]) -> Judgement:
+        """Use suspect channels again where the model in force has suspected them, too, and does no longer.
+
+        Probes during a hold have shown it there, or a person has said so. Channels that return, or are loose, are left
+        to this watch: what they showed was wrong.
+
+        Parameters
+        ----------
+        engine : Engine
+            Engine of the compensation; its state becomes that of the engine that has believed the channels.
+        reasons : sequence of str
+            Those of the model in force at this sample.
+        """
+        state, names = self._jump.state, self.suspects
+        suspected = [f"{Reason.SUSPECT_CHANNEL}:{name}" in reasons for name in names]
+        was_in_force, state.in_force = state.in_force, bool(names) and all(suspected)
+        if not (names and was_in_force) or any(suspected) or not self._jump.stays:
+            return Judgement()
+        before = self._before()
+        is_confirmed = not any(f"{Reason.UNCONFIRMED_CHANNEL}:{name}" in reasons for name in names)
+        found = self._jump.believe(engine, is_confirmed=is_confirmed)
         self._end_hindsight()
         self._forget(*before)
         return found

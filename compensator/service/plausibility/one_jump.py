@@ -261,6 +261,25 @@ class OneJump:
             self.end()
         return Judgement(estimate, accepted=accepted, zeros=_moved(before, engines.zero_in_use))
 
+    @property
+    def stays(self) -> bool:
+        """Whether channels have jumped once, and stay there: none is where it was before, or exchanged, or loose."""
+        state = self.state
+        is_back = state.at_held > 0 or any(jump.back for jump in state.jumps.values())
+        return state.phase == Phase.SUSPECT and not (is_back or state.may_be_exchanged or is_unsteady(state))
+
+    def believe(self, engine: Engine, *, is_confirmed: bool) -> Judgement:
+        """Use suspect channels again as they are; others have shown that they are right, or may be."""
+        engines, before = self._engines, self.zero_in_use
+        if is_confirmed or engines is None:
+            return self.release(engine, None, new_zero=False)
+        accepted = dict.fromkeys(self.suspects, NAN)
+        estimate = engines.give(engine, engines.believing)
+        self._leave_beside()
+        self.state.phase = Phase.UNCONFIRMED
+        self.state.start_evidence()
+        return Judgement(estimate, accepted=accepted, zeros=_moved(before, engines.zero_in_use))
+
     def _take_as_zero(
         self, engine: Engine, engines: JumpEngines, used: Estimate | None
     ) -> tuple[dict[str, float], Estimate | None]:

@@ -74,7 +74,7 @@ class Shadow:
         received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
         self.compensation.receive_probes([probe for probe in received if probe is not None])
         other = self.compensation.process(outcome.sample)
-        self.compensation.believe_wires(outcome.offset.reasons)
+        self.compensation.believe_as_in_force(outcome.offset.reasons)
         return msgspec.structs.replace(outcome, probes=probes), other
 
 

@@ -186,8 +186,8 @@ class RecordedRun:
             return None
         # An offset that cannot be read says nothing of them.
         with suppress(DataError):
-            if self.compensation.plausibility.exchanged and step.offset is not None:
-                self.compensation.believe_wires(step.offset.reasons)
+            if self.compensation.waits_for_resume and step.offset is not None:
+                self.compensation.believe_as_in_force(step.offset.reasons)
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
