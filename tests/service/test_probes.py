@@ -41,13 +41,18 @@ from compensator.service.probing.state import PastSample, ProbingState
 from compensator.service.probing.wanted import wanted_after
 from compensator.service.publisher import Publisher
 from compensator.service.state import decode_state
+from compensator.service.transfer.shadow import Shadow
 from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
 from tests.service.living import MACHINE, check_files, largest_step
+from tests.service.looping import machine, stronger
+from tests.service.looping import settings as loop_settings
 from tests.service.probed import PROBE, PROBED, RATE_UM, ProbedMachine
+from tests.service.records import QUILL
 from tests.service.simulated import START_NS
 from tests.service.test_compensation_day import MISSING
+from tests.service.test_jumps_beside import probed
 
 MINUTE_NS = 60 * NS
 
@@ -514,6 +519,30 @@ async def test_a_clock_that_was_set_back_makes_times_unknown_and_later_probes_ar
     await machine.run(200)
     assert machine.codes() == ["taken", "taken", ProbeCode.TIME_UNKNOWN, "taken"]
     assert nothing_jumped(machine)
+
+
+@pytest.mark.parametrize("set_back", [(), (80,), (80, 100)])
+def test_a_model_keeps_what_it_has_learned_though_the_clock_was_set_back(set_back: tuple[int, ...]) -> None:
+    probe = ProbeSettings(std_um=0.5, measured_max_um=200.0, largest_um=60.0, tolerance_um=3.0)
+    conf = msgspec.structs.replace(loop_settings(), probe=probe)
+    present, outcome, truth_um = Compensation(conf, QUILL), None, 0.0
+    shadow = Shadow(Compensation(conf, parse_model(stronger(0.2), source="test")), b"")
+    for i, sample in enumerate(machine(150, lambda i: 0.0)):
+        if outcome is not None and i % 20 == 0:
+            present.receive_probes([probed(truth_um, outcome.offset)])
+        truth_um = number(sample.channels["y_um"].mean)
+        channels = {name: one for name, one in sample.channels.items() if name != "y_um"}
+        channels["y_um"] = msgspec.structs.replace(
+            sample.channels["y_um"], mean=None, quality="invalid", device_quality="invalid"
+        )
+        time_ns = sample.time_utc_ns - sum(300 * NS for at in set_back if i >= at)
+        outcome = present.process(msgspec.structs.replace(sample, channels=channels, time_utc_ns=time_ns))
+        shadow.process(outcome)
+    other = shadow.compensation
+    assert other.probing is not None and other.probing.state.correction != {}
+    learned = other.probing.state.correction
+    other.continue_from(present.status.handover)
+    assert other.probing.state.correction == learned
 
 
 async def test_a_restart_reproduces_the_correction(tmp_path: Path) -> None:

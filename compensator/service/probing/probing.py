@@ -26,7 +26,7 @@ from compensator.model.correction import ProbeCorrection
 from compensator.service.probing.checks import check_probe
 from compensator.service.probing.past import predicted_at
 from compensator.service.probing.received import UNKNOWN_UM, ProbeRefused, ReceivedProbe, Verdict, recorded_probe
-from compensator.service.probing.state import KnownProbe, PastSample, ProbingState
+from compensator.service.probing.state import UNKNOWN_NS, KnownProbe, PastSample, ProbingState
 from compensator.service.probing.wanted import Wanted, wanted_after
 
 #: Samples that are kept beyond `probe.oldest_min`: a probe is compared with the one after it, and waits for a sample.
@@ -183,7 +183,7 @@ class Probing:
         """Advance to a sample, before its offset is known."""
         if self._state.samples and sample.time_ns <= self._state.samples[-1].time_ns:
             # The clock was set back: which sample a time belongs to is not known any more.
-            self._state.samples, self._state.zero_ns = [], 0
+            self._state.samples, self._state.zero_ns = [], min(self._state.zero_ns, UNKNOWN_NS)
             self._state.known = [known for known in self._state.known if known.time_ns < sample.time_ns]
         self._correction.step(sample.contributions_um, self._period_s / 60.0)
         self._state.samples = [*self._state.samples[1 - self._kept :], sample]

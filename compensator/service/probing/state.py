@@ -8,6 +8,10 @@ from typing import Any
 import msgspec
 
 
+#: Time of a zero by a clock that was set back since then: before every probe.
+UNKNOWN_NS = 1
+
+
 class PastSample(msgspec.Struct, frozen=True, array_like=True):
     """What a probe is compared with: prediction and offset of one sample.
 
@@ -69,7 +73,8 @@ class ProbingState:
     features : list of str
         Features that were probed since the zero.
     zero_ns : int
-        Time of the last zero, ns since 1970 UTC; 0 if it is not known.
+        Time of the last zero, ns since 1970 UTC; `UNKNOWN_NS` if the clock was set back since then, 0 if nothing of it
+        is known.
     refused : str
         Code of the last probe if it was refused and another one is wanted for it.
     """
