@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,13 +22,14 @@ from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.events import EventKind
-from compensator.messages import Candidate, Event
+from compensator.messages import Candidate, Event, number
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.event_log import EventLog
 from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
+from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import model_store
@@ -386,9 +388,10 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
     checked(machine)
 
 
-async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_the_exchange(tmp_path: Path) -> None:
-    machine = Looping(tmp_path, shown(extended()))
-    copy = tmp_path / "killed"
+async def killed_as_the_model_was_stored(folder: Path) -> Looping:
+    """Return a machine whose service was killed between a stored model and its first sample."""
+    machine = Looping(folder, shown(extended()))
+    copy = folder / "killed"
 
     def stored() -> None:
         model = machine.outcomes[-1].offset.model_sha256 if machine.outcomes else ""
@@ -404,6 +407,11 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     assert last.offset.model_sha256 == sha256_of(QUILL)
     shutil.rmtree(machine.recordings)
     copy.rename(machine.recordings)
+    return machine
+
+
+async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_the_exchange(tmp_path: Path) -> None:
+    machine = await killed_as_the_model_was_stored(tmp_path)
     await machine.run(30)
     after = machine.outcomes[-30:]
     assert {outcome.offset.model_sha256 for outcome in after} == {sha256_of(extended())}
@@ -413,6 +421,28 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     assert {one.role for one in machine.candidates()[-30:]} == {"before"}
     assert machine.events("adopt")[-1].data["by"] == "loop"
     checked(machine)
+
+
+async def test_an_exchange_that_is_completed_goes_on_from_what_was_published_while_the_disk_failed(
+    tmp_path: Path,
+) -> None:
+    machine = await killed_as_the_model_was_stored(tmp_path)
+    last = machine.outcomes[-1].offset
+    early = msgspec.structs.replace(
+        last,
+        seq=last.seq + 3,
+        time_utc_ns=last.time_utc_ns + 180 * NS,
+        y_offset_um=number(last.y_offset_um) + 15.0,
+        state="hold",
+        reasons=["operator_hold", "recording_late"],
+    )
+    OffsetCheckpoint(machine.recordings, MACHINE, machine.folder).write(early)
+    await machine.sleep(3)
+    await machine.run(3)
+    after = [outcome.offset for outcome in machine.outcomes[-3:]]
+    assert {one.model_sha256 for one in after} == {sha256_of(extended())}
+    assert {one.y_offset_um for one in after} == {early.y_offset_um}
+    assert all("operator_hold" in one.reasons for one in after)
 
 
 async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(

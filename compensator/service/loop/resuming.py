@@ -92,7 +92,10 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
 
 def _complete(resumed: Resumed, last: _Replayed) -> list[Note]:
     """Complete an exchange whose model is stored already."""
-    old = last.compensation
+    old, published = last.compensation, resumed.compensation.status.handover
+    # What was published while the disk failed is not in the recording: the offset, and whether it is held.
+    old.take_offsets(published.offset_um, published.further)
+    old.take_holds(operator_hold=published.operator_hold, internal_error=published.internal_error)
     resumed.compensation, _, notes = last.core.exchange(old, last.model, old.status.time_utc_ns)
     return notes
 
