@@ -121,7 +121,15 @@ class Daemon:
         self._sampler = Sampler(config, devices, clock, self._events.note)
         self._loop: LiveLoop | None = None
         if loop is not None:
-            self._loop = LiveLoop(config, loop, recordings, events=self._events, journal=self._journal, clock=clock)
+            self._loop = LiveLoop(
+                config,
+                loop,
+                recordings,
+                events=self._events,
+                journal=self._journal,
+                clock=clock,
+                is_adopting=lambda: self._adoption.is_under_way,
+            )
         self._adoption = Adoption(
             config,
             recordings,

@@ -7,10 +7,12 @@ import errno
 import json
 import math
 import shutil
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import msgspec
 import numpy as np
@@ -21,7 +23,7 @@ from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import parse_config
-from compensator.events import EventKind
+from compensator.events import ComparisonData, EventKind, NotJudged
 from compensator.messages import Candidate, Event, number
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
@@ -32,7 +34,8 @@ from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
-from compensator.service.transfer import model_store
+from compensator.service.transfer import adoption, model_store
+from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.shadow import Shadow
 from compensator.watch.history import STEP_NS, MachineHistory
@@ -311,6 +314,42 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
     await machine.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(QUILL))
     await machine.run(5)
     assert last_state(machine).effects == last_state(machine).base_effects == []
+    checked(machine)
+
+
+async def test_what_the_loop_decides_while_a_person_goes_back_is_not_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or `back` would take the loop's model from the list of those in use, and not the one that it replaces."""
+    machine, first = Looping(tmp_path, shown(extended())), QUILL + b"# adopted before\n"
+    machine.store.adopt(first, name="first", time_utc_ns=1)
+    monkeypatch.setattr(machine, "diagnose", AsyncMock(return_value=shown(extended())))
+    await machine.run(960, until=in_phase(machine, "shadow"))
+    compared, go, running = threading.Event(), threading.Event(), asyncio.get_running_loop()
+
+    def slow(*_: Any, **__: Any) -> ComparisonData:
+        compared.set()
+        running.call_soon_threadsafe(machine.promises.open.clear)  # samples go on
+        go.wait(60.0)
+        return not_judged(NotJudged.NO_Y)
+
+    monkeypatch.setattr(adoption, "second_opinion", slow)
+    back = machine.at_sample[len(machine.outcomes) + 330] = Asked(machine, "back")
+    decided: list[int] = []
+
+    def until(outcome: Outcome) -> bool:
+        if not decided and any(event.data["step"] == "adopt" for event in machine.events("loop")):
+            decided.append(len(machine.outcomes))
+        if decided and len(machine.outcomes) == decided[0] + 5:
+            assert compared.is_set() and outcome.offset.model_sha256 == sha256_of(first)
+            go.set()
+            machine.promises.add(back.reply)
+        return outcome.offset.model_sha256 == sha256_of(QUILL)
+
+    await machine.run(600, until=until)
+    assert back.answer["ok"] and machine.store.in_use() == QUILL, back.answer
+    await machine.run(3)
+    assert machine.outcomes[-1].offset.model_sha256 == sha256_of(QUILL)
     checked(machine)
 
 

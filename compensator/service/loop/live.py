@@ -83,6 +83,9 @@ class LiveLoop:
         Folder of the recordings, on which a candidate is warmed up.
     events, journal, clock
         Of the service.
+    is_adopting : callable, optional
+        Returns whether a person's change of the model is being prepared: it ends what the loop has decided, whose model
+        must not be stored meanwhile.
     """
 
     def __init__(
@@ -94,8 +97,10 @@ class LiveLoop:
         events: EventLog,
         journal: Journal,
         clock: Clock,
+        is_adopting: Callable[[], bool] = lambda: False,
     ) -> None:
         self._config, self._model = config, parts.model
+        self._is_adopting = is_adopting
         self._recordings, self._store = recordings, parts.store
         self._diagnose = parts.diagnose
         self._events, self._journal, self._clock = events, journal, clock
@@ -331,7 +336,7 @@ class LiveLoop:
     def after_sample(self) -> None:
         """Begin what was decided with a sample that is published."""
         storing = self._storing
-        if storing.is_done and not (storing.is_working or self.is_exchanging):
+        if storing.is_done and not (storing.is_working or self.is_exchanging or self._is_adopting()):
             # An exchange that a defect has ended: the next start must find the model that goes on.
             storing.begin_again(self._model, model_of(self._config, self._model, source="present model").name)
         self._guarded(self._begin_decided, None)
@@ -340,8 +345,9 @@ class LiveLoop:
         """Begin a diagnosis that is wanted, and to store the model of a decided exchange."""
         if core.loop.wanted is not None and self._task is None and self._found is None:
             self._task = asyncio.create_task(self._make_diagnosis(core))
-        if core.state.exchange and not (self._storing.is_working or self._storing.is_done):
-            self._storing.begin(core)
+        storing = self._storing
+        if core.state.exchange and not (storing.is_working or storing.is_done or self._is_adopting()):
+            storing.begin(core)
 
     def status(self) -> LoopStatus | None:
         """Return how the loop is, for `thermal/status`; None if it is off."""
