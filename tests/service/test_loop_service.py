@@ -353,6 +353,20 @@ async def test_what_the_loop_decides_while_a_person_goes_back_is_not_stored(
     checked(machine)
 
 
+async def test_what_a_person_goes_back_from_without_the_service_is_avoided_as_with_it(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(960, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await machine.run(5)
+    machine.store.back(name="quill", time_utc_ns=machine.clock.utc_ns())
+    await machine.run(5)
+    (avoided,) = last_state(machine).avoided
+    assert avoided.effects == EFFECT and last_state(machine).effects == []
+    # Once: a configuration that is edited afterwards is no `back`.
+    machine.use(machine.config_bytes + b"# a remark\n")
+    await machine.run(5)
+    assert [one.effects for one in last_state(machine).avoided] == [EFFECT]
+
+
 def last_state(machine: Looping) -> LoopState:
     """Return the state of the loop with which the last recording begins."""
     return decode_loop(opening_of(recordings(machine.recordings, MACHINE)[-1])["loop.json"])

@@ -46,8 +46,9 @@ from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
 from tests.service.living import MACHINE, check_files, largest_step
-from tests.service.looping import machine, stronger
+from tests.service.looping import machine as loop_machine
 from tests.service.looping import settings as loop_settings
+from tests.service.looping import stronger
 from tests.service.probed import PROBE, PROBED, RATE_UM, ProbedMachine
 from tests.service.records import QUILL
 from tests.service.simulated import START_NS
@@ -527,7 +528,7 @@ def test_a_model_keeps_what_it_has_learned_though_the_clock_was_set_back(set_bac
     conf = msgspec.structs.replace(loop_settings(), probe=probe)
     present, outcome, truth_um = Compensation(conf, QUILL), None, 0.0
     shadow = Shadow(Compensation(conf, parse_model(stronger(0.2), source="test")), b"")
-    for i, sample in enumerate(machine(150, lambda i: 0.0)):
+    for i, sample in enumerate(loop_machine(150, lambda i: 0.0)):
         if outcome is not None and i % 20 == 0:
             present.receive_probes([probed(truth_um, outcome.offset)])
         truth_um = number(sample.channels["y_um"].mean)

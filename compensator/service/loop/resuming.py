@@ -8,7 +8,6 @@ loop has been off, the shadow ends; what was gone back from or dismissed stays k
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +51,12 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mo
     config = loaded.config
     if config.loop is None or not config.loop.is_on:
         return None
-    calibrated = calibrated_effects(config, store, effect_names(resumed.compensation.model.effects))
-    return _continued(loaded, resumed, calibrated)
+    return _continued(loaded, resumed, store)
 
 
-def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]) -> ModelLoop:
+def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ModelLoop:
     config, present = loaded.config, resumed.compensation
+    calibrated = calibrated_effects(config, store, effect_names(present.model.effects))
     try:
         last = _replayed(config, loaded.resolve(config.recording.folder))
     except CompensatorError as error:
@@ -85,9 +84,19 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, calibrated: Sequence[str]
     if not last.is_last:
         # No clock was set while it was off, and nothing that it counts went on.
         core.state.time_utc_ns, core.state.misfit_min, core.state.usable_min = now_ns, 0.0, 0.0
-    resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated)
+    back = last.compensation.model.sha256 != present.model.sha256 and _is_gone_back_to(store, present)
+    resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated, back=back)
     core.drop_ended()
     return ModelLoop(config, present.model, core.attachments())
+
+
+def _is_gone_back_to(store: ModelStore, present: Compensation) -> bool:
+    """Return whether a person has gone back to the present model, without the service or just before its end."""
+    try:
+        return store.was_gone_back_to(present.model.sha256)
+    except CompensatorError as error:
+        log.error("the changes of the model cannot be read: %s", error)
+        return False
 
 
 def _complete(resumed: Resumed, last: _Replayed) -> list[Note]:

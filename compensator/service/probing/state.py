@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 
-
 #: Time of a zero by a clock that was set back since then: before every probe.
 UNKNOWN_NS = 1
 

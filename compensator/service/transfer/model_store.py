@@ -97,6 +97,11 @@ class ModelStore:
         in_use = self._read().in_use
         return bool(in_use) and sha256 == (in_use[-2].sha256 if len(in_use) > 1 else self._configured_sha256)
 
+    def was_gone_back_to(self, sha256: str) -> bool:
+        """Return whether the last change was a person's `back` to the model of a hash."""
+        last = next(reversed(self._read().history), None)
+        return last is not None and (last.sha256, last.action, last.by) == (sha256, "back", UNSET)
+
     def file_of(self, sha256: str) -> bytes:
         """Return the file of a model that is or was in use."""
         return self.configured if sha256 == self._configured_sha256 else self.load(sha256)
