@@ -403,6 +403,21 @@ async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path
     checked(machine)
 
 
+async def test_a_kill_as_a_file_is_begun_is_no_time_without_the_loop(tmp_path: Path) -> None:
+    """The state of the compensation is on disk, and that of the loop is not."""
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(EVENING + 60)
+    (path,) = recordings(machine.recordings, MACHINE)[-1:]
+    assert "candidate.toml" in opening_of(path)
+    await machine.run_and_kill(5)
+    path = recordings(machine.recordings, MACHINE)[-1]
+    path.write_bytes(path.read_bytes()[: path.read_bytes().index(b"loop.json") - 4])
+    assert list(opening_of(path)) == ["config.toml", "model.toml", "state.json"]
+    await machine.run(5)
+    assert machine.steps() == [("diagnose", "planned"), ("shadow", "")]
+    assert "candidate.toml" in opening_of(recordings(machine.recordings, MACHINE)[-1])
+
+
 async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made_once_more(tmp_path: Path) -> None:
     machine = Looping(tmp_path, shown(extended()))
     hangs, machine.waits_for_diagnoses = asyncio.Event(), False

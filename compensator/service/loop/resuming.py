@@ -26,6 +26,7 @@ from compensator.service.loop.storing import calibrated_effects
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.restart import Resumed
+from compensator.service.transfer.warm_up import usable_steps
 
 log = logging.getLogger("compensator")
 
@@ -125,7 +126,8 @@ def _replayed(config: Config, folder: Path) -> _Replayed | None:
         if began_ns(path, machine) < newest_ns - config.loop.watch_h * HOUR_NS:
             return None
         if LOOP_STATE not in opening:
-            is_last = False
+            # One that ends within its opening says nothing of the loop: the service was killed as it began the file.
+            is_last = is_last and next(usable_steps(path), None) is None
             continue
         with Container(path) as container:
             contents = container.survey(whole=False)
