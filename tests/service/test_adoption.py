@@ -246,9 +246,38 @@ async def test_a_model_that_fails_as_it_takes_over_is_not_found_at_the_next_star
     assert {outcome.offset.model_sha256 for outcome in machine.outcomes} == {sha256_of(QUILL)}
     assert {outcome.offset.state for outcome in machine.outcomes} <= {"ok", "degraded"}
     assert machine.store.in_use() == QUILL
+    with pytest.raises(ServiceError, match="no previous model"):
+        machine.store.before()
     (event,) = machine.events("adopt")
     assert event.data["ok"] is False and "ZeroDivisionError: a defect; model quill goes on" in event.text
     assert check_files(machine) == 90
+
+
+@pytest.mark.parametrize(
+    "fails",
+    [
+        lambda store: store.adopt(STRONGER + b"# another\n", name="another", time_utc_ns=3),
+        lambda store: store.back(name="quill", time_utc_ns=3),
+    ],
+)
+def test_the_model_of_the_loop_is_its_own_also_after_another_change_has_failed(
+    tmp_path: Path, fails: Callable[[ModelStore], None]
+) -> None:
+    store, calibrated = ModelStore(tmp_path, QUILL, MACHINE), QUILL + b"# calibrated\n"
+    store.adopt(calibrated, name="calibrated", time_utc_ns=1)
+    store.adopt(STRONGER, name="stronger", time_utc_ns=2, by_loop=True)
+    fails(store)
+    store.go_on_with(sha256_of(STRONGER), name="stronger", time_utc_ns=4)
+    assert (store.in_use(), store.calibrated(), store.before()) == (STRONGER, calibrated, calibrated)
+    store.back(name="calibrated", time_utc_ns=5)
+    assert store.in_use() == calibrated and store.before() == QUILL
+    # Nothing is left of one that fails beside the configured model either.
+    store.back(name="quill", time_utc_ns=6)
+    store.adopt(STRONGER, name="stronger", time_utc_ns=7)
+    store.go_on_with(sha256_of(QUILL), name="quill", time_utc_ns=8)
+    assert store.in_use() == QUILL
+    with pytest.raises(ServiceError):
+        store.before()
 
 
 @pytest.mark.parametrize("minutes", [10.0, 40.0])

@@ -12,7 +12,7 @@ from compensator.errors import CompensatorError, ServiceError
 from compensator.model.effects.names import effect_names
 from compensator.service.compensation import model_of
 from compensator.service.loop.core import ModelLoop
-from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.model_store import ModelStore, sha256_of
 
 log = logging.getLogger("compensator")
 
@@ -69,7 +69,7 @@ class Storing:
         now_ns = self._clock.utc_ns()
 
         def store() -> None:
-            self._store.adopt(model, name=name, time_utc_ns=now_ns, by_loop=True)
+            self._store.go_on_with(sha256_of(model), name=name, time_utc_ns=now_ns)
 
         self._task = asyncio.create_task(self._stored(store, again=True))
 

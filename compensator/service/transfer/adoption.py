@@ -244,8 +244,7 @@ class Adoption:
         text = f"refused: internal error: {type(error).__name__}: {error}; model {present.name} goes on"
         try:
             assert self._store is not None
-            data = self._store.file_of(present.sha256)
-            self._store.adopt(data, name=present.name, time_utc_ns=self._clock.utc_ns())
+            self._store.go_on_with(present.sha256, name=present.name, time_utc_ns=self._clock.utc_ns())
         except ServiceError as not_stored:
             text += f"; the next start uses the other one: {not_stored}"
         self._events.note(EventKind.ADOPT, text, {"ok": False, "action": order.action})

@@ -102,10 +102,6 @@ class ModelStore:
         last = next(reversed(self._read().history), None)
         return last is not None and (last.sha256, last.action, last.by) == (sha256, "back", UNSET)
 
-    def file_of(self, sha256: str) -> bytes:
-        """Return the file of a model that is or was in use."""
-        return self.configured if sha256 == self._configured_sha256 else self.load(sha256)
-
     def load(self, sha256: str) -> bytes:
         """Return a model file of the store."""
         if re.fullmatch("[0-9a-f]{64}", sha256) is None:
@@ -141,6 +137,20 @@ class ModelStore:
             contents.in_use.pop()
         sha256 = contents.in_use[-1].sha256 if contents.in_use else self._configured_sha256
         contents.history.append(Adopted(sha256=sha256, name=name, time_utc_ns=time_utc_ns, action="back", by=by))
+        self._write(contents)
+
+    def go_on_with(self, sha256: str, *, name: str, time_utc_ns: int) -> None:
+        """Use the model from before the last change again, which has failed; who had adopted it stays known."""
+        contents, was_adopted = self._read(), False
+        in_use, history = contents.in_use, contents.history
+        if in_use and history and history[-1].action == "adopt":
+            was_adopted, _ = True, in_use.pop()
+        entry = Adopted(sha256=sha256, name=name, time_utc_ns=time_utc_ns)
+        if sha256 != (in_use[-1].sha256 if in_use else self._configured_sha256):
+            known = [one for one in history if (one.sha256, one.action) == (sha256, "adopt")]
+            in_use.append(known[-1] if known else entry)
+        by = in_use[-1].by if in_use else UNSET
+        history.append(msgspec.structs.replace(entry, action="back" if was_adopted else "adopt", by=by))
         self._write(contents)
 
     # ------------------------------------------------------------------ files
