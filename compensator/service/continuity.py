@@ -308,6 +308,8 @@ class Continuity:
         """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""
         self._zero.y_base -= um
         self._zero.level += um
+        if self.probing is not None:
+            self.probing.raise_level(um)
 
     @property
     def level_um(self) -> float:

@@ -32,7 +32,7 @@ from compensator.model.thermal_model import Path as ModelPath
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
-from compensator.service.compensation import Compensation
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loading import load
 from compensator.service.probing.past import offsets_at, predicted_at, published_at
 from compensator.service.probing.probing import Probing
@@ -544,6 +544,25 @@ def test_a_model_keeps_what_it_has_learned_though_the_clock_was_set_back(set_bac
     learned = other.probing.state.correction
     other.continue_from(present.status.handover)
     assert other.probing.state.correction == learned
+
+
+def test_a_probe_of_the_sample_before_a_raised_level_shows_no_part_of_it() -> None:
+    """Y is larger by as much: the probe comes after the adoption, and lies between two samples."""
+    probe = ProbeSettings(std_um=0.5, measured_max_um=200.0, largest_um=60.0, tolerance_um=3.0)
+    conf = msgspec.structs.replace(loop_settings(), probe=probe)
+    shown_um = []
+    for raised_um in (0.0, 6.0):
+        compensation, outcomes, truth_um = Compensation(conf, QUILL), list[Outcome](), 0.0
+        for i, sample in enumerate(loop_machine(61, lambda i: 0.0)):
+            if i == 60:
+                compensation.raise_level(raised_um)
+                truth_um += raised_um
+            if i in (20, 40, 60):
+                compensation.receive_probes([probed(truth_um, outcomes[-1].offset)])
+            truth_um = number(sample.channels["y_um"].mean)
+            outcomes.append(compensation.process(sample))
+        shown_um.append([number(one.innovation_um) for outcome in outcomes for one in outcome.probes])
+    assert len(shown_um[0]) == 3 and shown_um[1] == pytest.approx(shown_um[0], abs=1e-9)
 
 
 async def test_a_restart_reproduces_the_correction(tmp_path: Path) -> None:

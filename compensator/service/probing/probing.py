@@ -173,6 +173,10 @@ class Probing:
         """Account for other shares of each path and effect at the zero: the engine's state was wrong then."""
         self._correction.move_zero([now - before for before, now in zip(before_um, now_um, strict=True)])
 
+    def raise_level(self, um: float) -> None:
+        """Raise what was predicted for the last samples by a constant, µm: probes of their time are still to come."""
+        self._state.samples = [msgspec.structs.replace(sample, y_um=sample.y_um + um) for sample in self._state.samples]
+
     def pass_time(self, contributions_um: Sequence[float], minutes: float) -> None:
         """Advance over samples that were not measured."""
         self._correction.step(contributions_um, minutes)
