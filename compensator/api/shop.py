@@ -129,7 +129,9 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
         return summary.result()
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
-    config = msgspec.structs.replace(config, loop=Loop(policy=policy))
+    # A table that is off keeps its other settings: with them the service would decide.
+    loop = msgspec.structs.replace(config.loop or Loop(policy=policy), policy=policy)
+    config = msgspec.structs.replace(config, loop=loop)
     alone = _Summary("", "", is_recorded=False)
     followed = _Followed(LoopRun(config, file, diagnosis_in_process(config)))
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))

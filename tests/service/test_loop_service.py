@@ -18,17 +18,19 @@ import msgspec
 import numpy as np
 import pytest
 
+from compensator.api import shop
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit, summary
 from compensator.clock import NS
-from compensator.config import parse_config
+from compensator.config import Config, parse_config
 from compensator.events import ComparisonData, EventKind, NotJudged
 from compensator.messages import Candidate, Event, number
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.event_log import EventLog
 from compensator.service.loop.process import DiagnosisProcess
+from compensator.service.loop.run import LoopRun
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
@@ -590,6 +592,23 @@ async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp
         (folder / "model.toml").read_bytes()
     )
     checked(machine)
+
+
+async def test_a_loop_of_a_shop_decides_by_the_settings_of_a_table_that_is_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Looping(tmp_path, shown(extended()), policy="off")
+    await machine.run(5)
+    used: list[Config] = []
+
+    def seen(config: Config, *others: Any) -> LoopRun:
+        used.append(config)
+        return LoopRun(config, *others)
+
+    monkeypatch.setattr(shop, "LoopRun", seen)
+    assert not shop.loop_of_machine(machine.recordings, "propose").error
+    assert machine.config.loop is not None
+    assert [one.loop for one in used] == [msgspec.structs.replace(machine.config.loop, policy="propose")]
 
 
 async def test_a_loop_that_is_off_says_what_to_set(tmp_path: Path) -> None:
