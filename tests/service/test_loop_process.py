@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.service.loop.process import DiagnosisProcess
+from compensator.service.loop.process import KEPT, DiagnosisProcess
 from compensator.service.loop.state import Running
 from compensator.service.loop.weighing import Diagnosed
 from tests.service.looping import extended, settings
@@ -67,6 +67,15 @@ async def test_what_it_finds_comes_with_the_model_and_the_page_stays(tmp_path: P
     folders = list((tmp_path / "diagnoses").iterdir())
     assert [folder.name for folder in folders] == ["2026-01-05T060000Z"]
     assert (folders[0] / "calibrated.toml").read_bytes() == QUILL
+
+
+@pytest.mark.parametrize("year", [2025, 2027])
+async def test_the_newest_diagnoses_are_kept_whatever_the_clock_was(tmp_path: Path, year: int) -> None:
+    for day in range(1, KEPT + 1):
+        (tmp_path / "diagnoses" / f"{year}-01-{day:02d}T020000Z").mkdir(parents=True)
+    await made(tmp_path, "pass")
+    kept = sorted(path.name for path in (tmp_path / "diagnoses").iterdir())
+    assert len(kept) == KEPT and "2026-01-05T060000Z" in kept and f"{year}-01-01T020000Z" not in kept
 
 
 @pytest.mark.parametrize(

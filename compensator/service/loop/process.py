@@ -120,8 +120,9 @@ class DiagnosisProcess:
     def _finish(self, work: Path, done: Path) -> None:
         shutil.rmtree(done, ignore_errors=True)
         work.rename(done)
-        older = sorted(path for path in self._folder.iterdir() if path.is_dir())[:-KEPT]
-        for path in older:
+        # What has a later name was made while the clock was ahead.
+        folders = [path for path in self._folder.iterdir() if path.is_dir()]
+        for path in sorted(folders, key=lambda path: (path.name <= done.name, path.name))[:-KEPT]:
             shutil.rmtree(path, ignore_errors=True)
 
 
