@@ -281,6 +281,14 @@ def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> 
     assert loop.state.misfit_min == 0.0
 
 
+@pytest.mark.parametrize("effects", [[], ["gain:DTF"]])
+def test_a_way_back_from_a_model_without_effects_keeps_no_effect_from_being_left_out(effects: list[str]) -> None:
+    """To be without an effect is what is diagnosed when the last one has ended: nobody has refused that."""
+    loop = Loop(LoopSettings(), 60.0, effects)
+    loop.model_changed(["input:coolant_degc"], 10 * HOUR_NS, calibrated=[], back=True)
+    assert [one.effects for one in loop.state.avoided] == ([effects] if effects else [])
+
+
 def test_what_was_shown_while_the_clock_was_ahead_counts_as_if_it_had_been_right() -> None:
     """The first two hours by a clock that is 100 h ahead: six hours in all are measured after four more."""
     loop = loop_of(place("a"), every_h=168)

@@ -408,7 +408,7 @@ class Loop:
             Whether the operator has gone back from the effects before.
         """
         state = self.state
-        if back:
+        if back and state.effects:
             avoid(state, state.effects, now_ns, self._settings.watch_h)
         state.effects, state.base_effects = list(effects), list(calibrated)
         state.forget_errors()
