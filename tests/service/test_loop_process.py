@@ -90,13 +90,20 @@ async def test_the_newest_diagnoses_are_kept_whatever_the_clock_was(tmp_path: Pa
         ),
         ("(folder / 'result.json').write_bytes(b' ' * 11_000_000)", "larger than"),
         ("raise SystemExit(3)", "ended with code 3"),
-        ("os.kill(os.getpid(), 9)", "ended by SIGKILL"),
+        (
+            "raise ZeroDivisionError('a defect' + 500 * '.')",
+            f"ended with code 1: ZeroDivisionError: a defect{171 * '.'}",
+        ),
+        ("sys.stderr.write('line\\n\\x1b[2Jhung\\n\\n'); raise SystemExit(3)", "ended with code 3: [2Jhung"),
+        ("os.kill(os.getpid(), 9)", "ended by SIGKILL; limit of memory: 1500 MB"),
         ("(folder / 'result.json').write_bytes(bytes(range(128, 256)))", "cannot be read"),
     ],
 )
 async def test_a_process_that_gives_nothing_is_a_diagnosis_that_failed(tmp_path: Path, script: str, why: str) -> None:
     found = await made(tmp_path, script)
     assert found.verdict == "failed" and found.model is None and why in found.needs, found
+    assert ("limit of memory" in found.needs) is ("SIGKILL" in why)
+    assert len(found.needs) < 300
 
 
 async def test_one_that_hangs_is_ended_with_everything_that_it_has_started(tmp_path: Path) -> None:
@@ -131,7 +138,7 @@ async def test_one_that_eats_memory_fails_and_has_a_low_priority(tmp_path: Path)
     """
     )
     found = await made(tmp_path, script, memory_mb=400.0)
-    assert found.verdict == "failed" and "ended with code 1; limit of memory: 400 MB" in found.needs
+    assert found.verdict == "failed" and "ended with code 1: MemoryError; limit of memory: 400 MB" in found.needs
     niceness, is_batch = (tmp_path / "diagnoses" / "nice").read_text(encoding="utf-8").split()
     assert int(niceness) >= 10 and is_batch == "True"
 

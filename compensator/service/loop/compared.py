@@ -153,8 +153,8 @@ class Compared:
         Parameters
         ----------
         is_new : bool
-            Whether it is not the model before the last adoption: it has fewer effects, or older parameters of the present
-            ones. What it leaves about the zero then counts at the level of its return, unless it is the
+            Whether it is not the model before the last adoption: it has fewer effects, or older parameters of the
+            present ones. What it leaves about the zero then counts at the level of its return, unless it is the
             calibrated model, whose own level is right.
         """
         found, residuals_um = self._place.verdict, self._comparison.residuals_um

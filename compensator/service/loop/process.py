@@ -40,6 +40,9 @@ KEPT = 14
 #: Waiting for a process that was killed, s.
 _KILLED_S = 5.0
 _UNFINISHED = ".part"
+#: What the process has to say of its errors; of its last bytes the last line is cited, so many characters of it.
+ERRORS = "errors.txt"
+_TAIL, _CITED = 4096, 200
 
 
 class DiagnosisProcess:
@@ -98,14 +101,15 @@ class DiagnosisProcess:
     async def _run(self, work: Path) -> str:
         """Run the process; return why it gave nothing, empty if it ended well."""
         limit_s = 60.0 * self._settings.time_limit_min
-        process = await asyncio.create_subprocess_exec(
-            *self._command,
-            str(work),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        with (work / ERRORS).open("wb") as errors:
+            process = await asyncio.create_subprocess_exec(
+                *self._command,
+                str(work),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.DEVNULL,
+                stderr=errors,
+                start_new_session=True,
+            )
         try:
             async with asyncio.timeout(limit_s):
                 code = await process.wait()
@@ -113,9 +117,14 @@ class DiagnosisProcess:
             return f"it took longer than loop.time_limit_min = {self._settings.time_limit_min:g}"
         finally:
             await _end(process)
-        if code < 0:
-            return f"it was ended by {signal.Signals(-code).name}"
-        return f"it ended with code {code}; limit of memory: {self._settings.memory_mb:g} MB" if code else ""
+        if code == 0:
+            return ""
+        said = await asyncio.to_thread(_last_line, work / ERRORS)
+        why = f"it was ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with code {code}"
+        why += f": {said}" if said else ""
+        # The kernel ends what needs too much without a word.
+        is_memory = code < 0 or MemoryError.__name__ in said
+        return f"{why}; limit of memory: {self._settings.memory_mb:g} MB" if is_memory else why
 
     def _finish(self, work: Path, done: Path) -> None:
         shutil.rmtree(done, ignore_errors=True)
@@ -134,6 +143,18 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         with suppress(TimeoutError):
             async with asyncio.timeout(_KILLED_S):
                 await process.wait()
+
+
+def _last_line(path: Path) -> str:
+    """Return the last line that the process has written, shortened; empty if there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - _TAIL, 0))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return ""
+    line = next((line for line in reversed(lines) if line.strip()), "")
+    return "".join(filter(str.isprintable, line.strip()))[:_CITED]
 
 
 def _read(work: Path) -> Diagnosed:
