@@ -8,6 +8,7 @@ import itertools
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -33,6 +34,7 @@ from compensator.service.loop.weighing import Weighed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import model_store, warm_up
+from compensator.service.transfer.adoption import Adoption, ModelRequest
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
 from compensator.service.transfer.shadow import Shadow
@@ -419,7 +421,13 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
     works = model_store.replace_file
     monkeypatch.setattr(model_store, "replace_file", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     assert [await sample() for _ in range(3)] == 3 * [present]
-    assert core.state.exchange == "back" and not events.note.called and store.in_use() == extended()
+    assert core.state.exchange == "back" and store.in_use() == extended()
+    ((_, said, data),) = [call.args for call in events.note.call_args_list]  # once
+    assert said.startswith("the way back waits: ") and "No space left on device" in said and data["ok"] is False
+    reply: Future[dict[str, Any]] = Future()
+    adoption = Adoption(config, tmp_path, store, events, files, clock=Mock(), running=lambda: present, loop=loop)
+    adoption.begin("back", ModelRequest(), reply, Mock(data=dict))
+    assert "No space left on device" in reply.result(timeout=0)["text"]
     monkeypatch.setattr(model_store, "replace_file", works)
     assert await sample() is before
     assert store.in_use() == QUILL and core.state.phase == "idle" and core.state.exchange == ""

@@ -112,6 +112,8 @@ class LiveLoop:
         self._found: Found | None = None
         self._warming: Found | None = None
         self._storing = Storing(parts.store, clock)
+        #: Why a decided way back has not happened yet; empty while nothing keeps it.
+        self.waits_for = ""
 
     @property
     def is_exchanging(self) -> bool:
@@ -153,7 +155,7 @@ class LiveLoop:
             return
         new, self._model, notes = core.exchange(present, self._model, present.status.time_utc_ns)
         in_force.append(new)
-        self._storing.is_done = False
+        self._storing.is_done, self.waits_for = False, ""
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._note(notes)
@@ -376,6 +378,7 @@ class LiveLoop:
             self._task.cancel()
         self._task = self._found = self._warming = None
         self._storing.cancel()
+        self.waits_for = ""
 
     def _give_up(self, core: ModelLoop, why: str) -> None:
         """End everything in shadow."""
@@ -394,7 +397,10 @@ class LiveLoop:
         incoming = core.incoming
         if incoming is None or core.state.exchange == "back":
             # The way back stays open: the model is stored again with the next sample.
-            log.error("the way back waits: %s", why)
+            if incoming is not None and why != self.waits_for:
+                text = f"the way back waits: {why}; it is tried again with each sample"
+                self._events.note(EventKind.ADOPT, text, {"ok": False, "action": "back", "by": "loop"})
+                self.waits_for = why
             return
         self._end_one(
             core, incoming.compensation.model.sha256, f"{why}; the present one stays, and it is compared no more"

@@ -122,6 +122,11 @@ class Exchanger(Protocol):
         """Whether a decided exchange has not happened yet: another change of the model has to wait."""
         ...
 
+    @property
+    def waits_for(self) -> str:
+        """Why a decided exchange does not happen yet; empty if nothing keeps it."""
+        ...
+
     def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
         """Begin anew after a command has changed the model."""
         ...
@@ -183,6 +188,8 @@ class Adoption:
             why = f"{action}: this service cannot change its model now"
             if self._order is not None or exchanging:
                 why = f"{action}: another model is being prepared; retry after the next sample"
+            if exchanging and self._loop is not None and self._loop.waits_for:
+                why = f"{action}: the loop goes back to another model, which waits: {self._loop.waits_for}"
             self._events.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
             reply.set_result(refusal(why))
             return
