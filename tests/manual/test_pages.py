@@ -31,7 +31,7 @@ SETTING = re.compile(r"^\| `(\w+\.\w+)` \| (-?[\d.e-]+(?:, -?[\d.e-]+)*) \|", fl
 #: Settings that are only shown; the page names them without a value.
 SHOWN = {"summary.SHOWN", "advice_words.SAID", "ceiling._NAMED"}
 #: Numbers of the loop that decide nothing.
-NO_SETTINGS = {"state.STATE_SCHEMA", "process._KILLED_S"}
+NO_SETTINGS = {"state.STATE_SCHEMA", "process._KILLED_S", "process._TAIL", "process._CITED"}
 
 
 def constant(room: str, holder: str, name: str) -> Any:
