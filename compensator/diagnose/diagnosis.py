@@ -30,7 +30,8 @@ from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.named_effects import named_effects, ranked
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import FOLDS, Diagnosis, Refused, Remainder, Verdict
+from compensator.diagnose.outcome import Diagnosis, Refused, Remainder, Verdict
+from compensator.diagnose.prediction import FOLDS
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.verdict import ceiling_of, judged
 from compensator.diagnose.warning_words import warnings_on

@@ -8,17 +8,16 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Indices, Mask, Vector, rms_of
+from compensator.arrays import Indices, Vector, rms_of
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.initial_state import as_begun
-from compensator.diagnose.likelihood import RandomColumns
-from compensator.diagnose.outcome import FOLDS, Step
+from compensator.diagnose.outcome import Step
 from compensator.diagnose.own_error import own_error_alone
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Rest
+from compensator.diagnose.prediction import FOLDS, Nuisances, left_of_block, zeros_known
 from compensator.diagnose.scan import Grid
-from compensator.diagnose.whitening import Whitening
 from compensator.display import listed
 from compensator.model.effects.hypothesis import Place
 from compensator.progress import ExecutorMap, Progress
@@ -107,20 +106,6 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     )
 
 
-def left_of_block(evidence: Evidence, block: Mask, knows_zero: Sequence[bool], predicted: Vector) -> Vector:
-    """Return what a prediction leaves of a block, µm; what is about a zero that it does not know about its own mean."""
-    left = np.where(block, evidence.residual - predicted, np.nan)
-    for own, is_known in zip(evidence.zeros.T > 0.0, knows_zero, strict=True):
-        if (block & own).any() and not is_known:
-            left[own] -= np.nanmean(left[own])
-    return np.asarray(left[block])
-
-
-def zeros_known(points: Points) -> tuple[bool, ...]:
-    """Return for each zero whether a point shows it; a few samples at the end of a run are none."""
-    return tuple(np.any(points.evidence.zeros[points.first] > 0.0, axis=0).tolist())
-
-
 #: With the rest of a search without effects, and with that beside them.
 _RESTS = ("without effects", "beside effects")
 _PREDICTED = (*(f"{name}, {rest}" for rest in _RESTS for name in ("base", "nothing")), "named", "whole", "ceiling")
@@ -175,7 +160,7 @@ def _predictions(
     if own_alone:
         own = found.remainder if found.is_own_error_alone else None
         whole = (own or own_error_alone(found.selection.before)).added
-    beside, alone = (_Nuisances(found.search.points, rest).beside for rest in rests)
+    beside, alone = (Nuisances(found.search.points, rest).beside for rest in rests)
     added |= {"named": found.named, "whole": whole, "ceiling": found.ceiling}
     nothing = {"base": by_base(seen) + of_time, "nothing": found.paths}
     predicted = {name: beside(one) for name, one in added.items()}
@@ -186,30 +171,6 @@ def _predictions(
         knows_zero=zeros_known(found.search.points),
         has=has,
     )
-
-
-class _Nuisances:
-    """Zeros and initial states of all runs as a part of the evidence knows them.
-
-    Parameters
-    ----------
-    points : Points
-        The part.
-    rest : Rest
-        What no effect explains, of all data: how far initial states are from rest, and how many samples count. A part
-        that does not see where a run begins says nothing of that.
-    """
-
-    def __init__(self, points: Points, rest: Rest) -> None:
-        self._points, self._whitening = points, Whitening(points, rest)
-        self._table = points.zeros_and_starts(rest)
-        self._white = self._whitening.of(points.averaged(self._table))
-
-    def beside(self, added: Vector) -> Vector:
-        """Return what effects add, with the most probable zeros and initial states beside them, on every sample."""
-        target = self._points.residual - self._points.averaged(added[:, None])[:, 0]
-        weights = RandomColumns(self._white, self._whitening.of(target[:, None])[:, 0]).mean
-        return np.asarray(added + self._table @ weights)
 
 
 def how_held_out(evidence: Evidence, beside: Sequence[str] = ()) -> str:

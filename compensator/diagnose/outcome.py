@@ -18,9 +18,6 @@ from compensator.model.thermal_model import ThermalModel
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
-#: Blocks that are held out, one after another.
-FOLDS = 3
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Remainder:

@@ -19,6 +19,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, rest_without_effects
 from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.prediction import Folds
 from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.standard_errors import deviations
 from compensator.diagnose.switching import switchings
@@ -35,6 +36,10 @@ ALIAS_FREE = 3.0
 #: Effects are proposed beside a small slow rest, too, if that of the fit is larger by the first factor, and beside one
 #: between them if it is larger by the second.
 SMALLER = (1.5, 6.0)
+#: Where the base leaves no more than it may by its own error, an input must add so much more to the evidence.
+EXPECTED = 8.0
+#: One explanation foretells clearly better than another if it leaves so much of its error on held-out blocks.
+FORETELLS = 0.8
 #: Kinds of what may change in a path that stays linear.
 OF_PATHS = ("dynamics", "gain", "delay")
 
@@ -128,7 +133,9 @@ class Search:
             grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
             best = self._pruned(grown)
         # What was left out as too small must not come back in the place of what it was too small beside.
-        best = self._with_simpler_name(self._exchanged(best, keep_last=False, apart_from=grown.places - best.places))
+        small = grown.places - best.places
+        best = self._with_simpler_name(self._exchanged(best, keep_last=False, apart_from=small))
+        best = self._foretelling(best, apart_from=small)
         if hidden := self._hidden(undecided, best):
             best = hidden
         return Selection(
@@ -152,13 +159,19 @@ class Search:
         apart_from : frozenset of Place
             Effects that are not looked for.
         """
-        while len(best.terms) < MOST and not self.criterion.is_expected(best):
+        while len(best.terms) < MOST:
+            expected = self.criterion.is_expected(best)
+            if expected and best.terms:
+                break
             proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
+            if expected:
+                # What may come by itself on another day is an error of the paths. What another channel adds is none.
+                candidates = [fit for fit in candidates if fit.terms[-1].hypothesis.effect.kind == "input"]
             better = max(candidates, key=self.criterion.score, default=best)
-            if self.criterion.score(better) <= self.criterion.score(best):
+            if self.criterion.score(better) <= self.criterion.score(best) + expected * EXPECTED:
                 return best, self._undecided(candidates, best)
             best = self._exchanged(better)
         return best, ()
@@ -325,6 +338,30 @@ class Search:
                         simple = settled(fit_terms(fit.likelihood, starts))
                         if without - self.criterion.rms(simple.terms) ** 2 > MOSTLY * all_of_it:
                             return simple
+        return fit
+
+    def _foretelling(self, fit: Fit, *, apart_from: frozenset[Place]) -> Fit:
+        """Exchange an effect, or its form, for one that is as likely, or nearly, and foretells clearly better.
+
+        Where explanations differ by less than the price of an effect, the evidence does not choose; a form of many lags
+        is as likely as one lag then, and elsewhere it runs free.
+        """
+        if self.evidence.is_sparse or self.evidence.free_paths or self.points.is_exact:
+            return fit
+        folds = Folds(self.points)
+        for i, term in enumerate(fit.terms):
+            if not term.effect.observed:
+                continue
+            others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
+            proposed = self._proposed(others, unobserved=False, apart_from=apart_from | others.places)
+            least = self.criterion.score(fit) - self.criterion.price
+            settled_ones = [settled(one) for one in proposed[:FITTED] if one.forms != fit.forms]
+            near = [one for one in settled_ones if self.criterion.score(one) > least]
+            if near:
+                errors = [folds.error_um(one) for one in near]
+                best = int(np.argmin(errors))
+                if errors[best] < FORETELLS * folds.error_um(fit):
+                    fit = near[best]
         return fit
 
     def _rivals(self, fit: Fit, index: int) -> tuple[Alternative, ...]:
