@@ -159,6 +159,9 @@ def _share(axis: str, diagnosis: Diagnosis, effect: FoundEffect, reference: Foun
     """Fit the size of an effect, in the form that was found, on an axis beside the effects that it has by itself."""
     named = any(one.place == effect.place for one in diagnosis.effects)
     evidence = diagnosis.evidence
+    if effect.path and ("DTF" if effect.path == "TTF" else effect.path) not in evidence.context.paths:
+        # A model without the path does not say how it would act here: perhaps as far as on the other axis.
+        return Share(axis=axis, moves_um=0.0, std_um=float(np.ptp((reference or effect).signal)), named=named)
     points = Points(evidence)
     others = [one.term.start for one in diagnosis.effects if one.place != effect.place]
     fit = _fitted(points, [*others, _in_its_form(effect.term)])

@@ -13,9 +13,10 @@ from compensator.api import diagnosis as api_diagnosis
 from compensator.cli import main
 from compensator.data.axes import of_axis
 from compensator.data.measurement import measurements, runs_in
-from compensator.diagnose.across import MachineEffect, Share
+from compensator.diagnose.across import MachineEffect, Share, across, missing_places
 from compensator.diagnose.criterion import MARGIN, Criterion
 from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.fit import Term, response
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_axes
 from compensator.model.model_writer import write_axes
@@ -134,6 +135,32 @@ def test_a_probe_is_suspected_only_where_the_others_surely_show_nothing():
     assert clear.suspect == "z" and "Y not (0.5 ± 0.4). Only Z shows it." in clear.sentence
     assert not unclear.suspect and unclear.sentence.endswith("X perhaps (6.0 ± 4.0).")
     assert not MachineEffect(place=PLACE, shares=(alone,)).suspect, "nothing to compare with"
+
+
+@pytest.mark.parametrize("z_has_path", [True, False])
+def test_no_probe_is_suspected_where_the_model_of_another_axis_lacks_the_path(z_has_path):
+    """Z has no more of the ambient than its model; a model without a TDTF shows nothing of that."""
+    bases, table = models(), machine(4, {}, hours=14.0)
+    if not z_has_path:
+        bases["z"] = dataclasses.replace(bases["z"], tdtf=None)
+
+    def evidence(axis):
+        return evidence_of(bases[axis], runs_in(of_axis(measurements(table, "data"), axis))[0])
+
+    gain = next(one for one in proposals(evidence("y").context) if one.place == ("gain", "TDTF", ""))
+    term = Term(hypothesis=gain, values=(), amplitudes=(0.5,))
+    added = response(evidence("y"), term)
+    table["y_um"] = table["y_um"] + added
+    effect = SimpleNamespace(place=gain.place, path="TDTF", channel=None, term=term, signal=added)
+    diagnoses = {
+        "y": SimpleNamespace(effects=(effect,), evidence=evidence("y")),
+        "z": SimpleNamespace(effects=(), evidence=evidence("z")),
+    }
+    [found] = across(diagnoses)
+    assert found.shares[0].moves_um == pytest.approx(np.ptp(added), rel=0.2)
+    assert found.suspect == ("y" if z_has_path else "")
+    assert f"Z {'not' if z_has_path else 'perhaps'} (" in found.sentence
+    assert not missing_places(diagnoses)
 
 
 def test_y_alone_is_diagnosed_as_without_the_other_axes(files):
