@@ -12,7 +12,7 @@ from compensator.arrays import Vector
 from compensator.diagnose.events import DAY, HEAT
 from compensator.diagnose.fit import Fit
 from compensator.diagnose.points import Points
-from compensator.diagnose.record_with_test import HOURS, RecordWithTest
+from compensator.diagnose.record_with_test import HOURS, RecordWithTest, values_within
 from compensator.diagnose.trials import REST_H, Trial, Trials
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.seen import roughly
@@ -60,7 +60,7 @@ class PlannedTest:
     @property
     def probes(self) -> int:
         """Number of probes in it; 0 where Y is measured all the time."""
-        return math.ceil(self.hours * 60.0 / self.every_min) if self.every_min else 0
+        return int(values_within(np.array(self.hours), self.every_min)) if self.every_min else 0
 
     @property
     def sentence(self) -> str:

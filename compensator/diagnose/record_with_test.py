@@ -46,10 +46,10 @@ class RecordWithTest:
     """
 
     def __init__(self, evidence: Evidence, trial: Trial, every_min: float) -> None:
-        n, samples = trial.signals.size, 1
-        self.every_min = every_min
-        if every_min:
-            samples = max(1, round(every_min / evidence.context.period_min))
+        n, period_min = trial.signals.size, evidence.context.period_min
+        samples = max(1, round(every_min / period_min)) if every_min else 1
+        #: Whole samples, as the probes of the test are.
+        self.every_min = samples * period_min if every_min else 0.0
         measured = (np.arange(n) + 1) % samples == 0
         self.evidence = dataclasses.replace(
             evidence,
@@ -61,8 +61,9 @@ class RecordWithTest:
             noise=dataclasses.replace(evidence.noise, count=evidence.count + int(measured.sum())),
         )
         self.points = Points(self.evidence)
-        self.before = int(self.points.starts[-1])
-        self.ends = np.ceil(np.array(HOURS) * 60.0 / (every_min or self.points.period_min)).astype(int)
+        # A test that is shorter than the time between two probes has no point.
+        self.before = int(np.searchsorted(self.points.first, evidence.used.size))
+        self.ends = values_within(np.array(HOURS), self.every_min or self.points.period_min)
         self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
 
     def change(self, first: Fit, second: Fit) -> Vector:
@@ -124,6 +125,25 @@ class RecordWithTest:
             moved = tuple(v + step if i == k else v for k, v in enumerate(term.values))
             columns.append(((response(moved)[0] - added) / STEP)[:, None])
         return added, np.concatenate(columns, axis=1) if columns else np.zeros((added.size, 0))
+
+
+def values_within(hours: Vector, every_min: float) -> Indices:
+    """Return how many values of Y are measured by the end of tests, the first one as the first interval ends.
+
+    Parameters
+    ----------
+    hours : numpy.ndarray, shape (durations,)
+        Durations of the tests, h.
+    every_min : float
+        Time between two values, min.
+
+    Examples
+    --------
+    >>> values_within(np.array([0.9, 1.5, 2.0, 4.0]), 60.0)
+    array([0, 1, 2, 4])
+    """
+    # 0.7 h are 42 min, whatever rounding makes of it.
+    return np.asarray(np.floor(hours * 60.0 / every_min + 1e-9), dtype=np.intp)
 
 
 def expected_change(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:

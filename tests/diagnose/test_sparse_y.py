@@ -9,13 +9,18 @@ import compensator as tc
 from compensator.diagnose import diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.detection_limit import detection_limits
+from compensator.diagnose.events import HEAT
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
+from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.record_with_test import HOURS, RecordWithTest
 from compensator.diagnose.search import Search
+from compensator.diagnose.trials import Trials
 from compensator.diagnose.whitening import Whitening
 from compensator.errors import DataError
+from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import tone_of
 from tests.diagnose.scenarios import draw, lag, record
@@ -157,9 +162,24 @@ def test_tests_are_counted_in_probes(gain):
     tests = [test for rival in gain.effects[0].rivals if (test := rival.test)]
     assert tests
     for test in tests:
-        assert test.probes == int(np.ceil(test.hours * 60.0 / test.every_min))
+        assert test.probes == test.hours * 60.0 // test.every_min
         assert f"{test.probes} more probes" in test.sentence
     assert gain.to_dict()["advice"]["tests"][0]["probes"] == tests[0].probes
+
+
+@pytest.mark.parametrize("every_min", [60, 240, 2160])
+def test_a_test_is_credited_with_the_probes_before_its_end(every_min):
+    evidence = evidence_of(QUILL, runs(probed("none", 1)))
+    trial = next(trial for trial in Trials(evidence).of([]) if trial.driver == HEAT)
+    joint = RecordWithTest(evidence, trial, float(every_min))
+    probed_at_h = (joint.points.first[joint.before :] + 1 - evidence.used.size) / 60.0
+    assert probed_at_h.tolist() == [every_min / 60.0 * (i + 1) for i in range(1440 // every_min)]
+    assert joint.ends.tolist() == [np.sum(probed_at_h <= hours) for hours in HOURS]
+    likelihood = Likelihood(joint.points.of(evidence), joint.points.typical_rest())
+    gain = next(one for one in proposals(evidence.context) if one.place == ("gain", "DTF", ""))
+    change = joint.change(fit_terms(likelihood, [(gain, ())]), fit_terms(likelihood, []))
+    assert np.all(change[joint.ends == 0] == 0.0)
+    assert (change[-1] > 0.0) == bool(joint.ends[-1])
 
 
 @pytest.mark.parametrize("kind", ["drift", "step", "input", "gain TDTF", "late path"])
