@@ -169,7 +169,7 @@ def _unexplained(found: Findings, *, explained_pct: float | None, is_explained: 
         course = found.remainder.added - found.own_paths
         return _described("remainder", found, course, _memory_min(course, evidence.context.period_min), [])
     if not is_explained:
-        course = evidence.left(found.whole + found.left_in_um) * evidence.used
+        course = np.where(evidence.used, evidence.left(found.whole + found.left_in_um), np.nan)
         left = _described("residual", found, course, fit.rest.tau_min, [])
         return left if left.rms_um > 0.0 else None
     return None

@@ -148,16 +148,30 @@ def follows_day(evidence: Evidence, course: Vector) -> bool:
 
 
 def steepest(evidence: Evidence, course: Vector, count: int) -> list[Time]:
-    """Return when a course that is no switching moves fastest: record and time, min, apart from each other."""
+    """Return when a course that is no switching moves fastest: record and time, min, apart from each other.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Records.
+    course : numpy.ndarray, shape (n,)
+        On every sample; NaN where it is not known.
+    count : int
+        Most times.
+    """
     found: list[tuple[float, Time]] = []
     period_min = evidence.context.period_min
     for record, run in zip(evidence.signals, evidence.samples_of_runs(), strict=True):
         part = course[run]
         wide = max(2, record.size // 200)
-        slope = np.abs(part[wide:] - part[:-wide])
+        # To the next known value that is at least so far away: a hole is crossed, and its edges are no movement.
+        known = np.flatnonzero(np.isfinite(part))
+        behind = np.searchsorted(known, known + wide)
+        first, last = known[behind < known.size], known[behind[behind < known.size]]
+        slope = np.abs(part[last] - part[first]) * (wide / (last - first))
         least = 0.5 * float(slope.max(initial=0.0))
         for at in np.argsort(slope)[::-1][: 20 * count].tolist():
-            time = record.number, (at + wide / 2.0) * period_min
+            time = record.number, float(first[at] + last[at]) / 2.0 * period_min
             apart = 4.0 * wide * period_min
             if slope[at] > least and all(r != time[0] or abs(t - time[1]) > apart for _, (r, t) in found):
                 found.append((float(slope[at]), time))

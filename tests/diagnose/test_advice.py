@@ -9,7 +9,7 @@ import pytest
 from compensator.diagnose.advice import Unexplained, _sensor, advice_of, resembling
 from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.events import follows_day, goes_with, swings, switched
+from compensator.diagnose.events import follows_day, goes_with, steepest, swings, switched
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
@@ -105,6 +105,34 @@ def test_a_course_follows_the_day_only_where_the_record_shows_days():
     assert not follows_day(long, np.sin(2.0 * np.pi * minutes / 500.0))
     short = evidence_of(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 31, 24.0)))
     assert not follows_day(short, np.sin(2.0 * np.pi * short.signals[0].minutes / 1440.0))
+
+
+def test_what_nothing_explains_moves_where_y_does_and_not_at_the_edges_of_its_holes():
+    """A slow walk, far from its mean where a door is open for half an hour and Y is missing."""
+    n, door = int(HOURS * 60), np.zeros(int(HOURS * 60))
+    for begin in range(200, n - 60, 240):
+        door[begin : begin + 30] = 1.0
+    walk = np.cumsum(np.random.default_rng(1).normal(0.0, 0.25, n))
+    columns = machine(lambda s: walk, 7)
+    columns = {name: columns[name] for name in ("t_q_degc", "at_degc")} | {
+        "y_um": np.where(door, np.nan, columns["y_um"]),
+        "door": door,
+    }
+    found = findings_of(evidence_of(QUILL, runs_from(columns)))
+    deciding = Deciding(Trials(found.search.evidence))
+    left = advice_of(found, deciding, between_rivals=[], explained_pct=None, is_explained=False).unexplained
+    assert left.kind == "residual" and left.goes_with is None and len(left.times) >= 3
+    edges = np.flatnonzero(np.diff(door)) / 60.0
+    near = [np.min(np.abs(edges - hour)) < 0.14 for _, hour in left.times]
+    assert np.mean(near) < 0.25, "by chance 15 %"
+
+
+def test_a_course_known_now_and_then_moves_between_its_values():
+    evidence = evidence_of(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 31)))
+    course = np.full(int(HOURS * 60), np.nan)
+    course[59::60] = 50.0
+    course[59 + 60 * 14 :: 60] = 30.0
+    assert steepest(evidence, course, 12) == [(0, 59.0 + 60.0 * 13.5)]
 
 
 def test_swings_count_ups_and_downs_and_no_noise():
