@@ -524,6 +524,11 @@ class ModelWarning(Code):
         "The model states a smaller standard deviation of its own error than the data show.",
         "Find out what differs from the calibration; a new calibration states the deviation of its own data.",
     )
+    CEILING_IN_PART = (
+        "ceiling_in_part",
+        "There are more channels than the ceiling and the remainder can have, so some are not in them.",
+        "Leave out of the data the channels that cannot act on Y.",
+    )
 
 
 class DataRemark(Code):

@@ -24,6 +24,8 @@ from compensator.diagnose.likelihood import STEP, RandomColumns
 from compensator.diagnose.points import Points, Rest, lags_of_paths
 from compensator.diagnose.refitted_paths import with_fewer_lags
 from compensator.diagnose.whitening import Whitening
+from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
@@ -84,13 +86,14 @@ class Background:
 
     def __init__(self, evidence: Evidence, *, channels: bool = True, recent: bool = False) -> None:
         context = evidence.context
-        base = [DRIVE["heat" if context.has_ttf else "direct"], *([AMBIENT] if context.has_ambient else [])]
-        inputs = [(name, 1.0) for name in base]
+        base = _inputs_of_base(context)
+        base = () if recent else base
+        paths, inputs = len(base), [(name, 1.0) for name in base]
         if channels:
-            inputs += [(name, 1.0) for name in context.channels]
-            inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
-        paths = 0 if recent else len(base)
-        inputs = inputs[len(base) - paths :][:MOST_CHANNELS]
+            named = most_alike(evidence, MOST_CHANNELS - paths)
+            inputs += [(name, 1.0) for name in named]
+            inputs += [(name, 2.0) for name in named if name in context.zeroed]
+        inputs = inputs[:MOST_CHANNELS]
         taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0) if channels else lags_of_paths(context)
         taus = RECENT_MIN if recent else taus
         self.template = Regression(
@@ -243,6 +246,42 @@ class _Problem:
             log_evidence=log_evidence,
             rest=self._rest(x),
         )
+
+
+def room_for_channels(context: Context) -> int:
+    """Return how many channels there may be beside the inputs of the base's own paths."""
+    return MOST_CHANNELS - len(_inputs_of_base(context))
+
+
+def most_alike(evidence: Evidence, count: int) -> tuple[str, ...]:
+    """Return at most so many of the channels that move, in their order: those whose best lag is most like the residual.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Residual and channels.
+    count : int
+        Most channels.
+    """
+    names = evidence.context.channels
+    if len(names) <= count:
+        return names
+    residual = evidence.without_nuisances(evidence.residual)
+    bank = FilterBank(LAGS_MIN, [(1.0,) * len(LAGS_MIN)], evidence.context.period_min)
+
+    def likeness(name: str) -> float:
+        courses = [record.channels[name] for record in evidence.signals]
+        table = np.concatenate([bank.columns(u - u[0]) for u in courses]) * evidence.used[:, None]
+        table = evidence.without_nuisances(table)
+        return float(np.max(np.abs(residual @ table) / np.maximum(np.linalg.norm(table, axis=0), 1e-12)))
+
+    kept = sorted(names, key=likeness, reverse=True)[:count]
+    return tuple(name for name in names if name in kept)
+
+
+def _inputs_of_base(context: Context) -> tuple[str, ...]:
+    """Return the inputs of the base's own paths."""
+    return DRIVE["heat" if context.has_ttf else "direct"], *([AMBIENT] if context.has_ambient else [])
 
 
 def strongest(root: Matrix, seen: Matrix) -> tuple[tuple[float, ...], ...]:

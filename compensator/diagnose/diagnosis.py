@@ -34,7 +34,7 @@ from compensator.diagnose.outcome import Diagnosis, Refused, Remainder, Verdict
 from compensator.diagnose.prediction import FOLDS
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.verdict import ceiling_of, judged
-from compensator.diagnose.warning_words import warnings_on
+from compensator.diagnose.warning_words import ceiling_in_part, warnings_on
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import Place
 from compensator.model.thermal_model import ThermalModel
@@ -227,6 +227,7 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
             *remarks,
             *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off),
             *warnings_on(chosen, deployed=deployed),
+            *ceiling_in_part(evidence.context),
         ),
         steps=held_out.steps,
         remainder=_remainder(found, held_out, deployed=deployed),

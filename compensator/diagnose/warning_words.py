@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
+from compensator.diagnose.background import room_for_channels
 from compensator.diagnose.deployment import Deployment
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.model.effects.hypothesis import EQUAL
+from compensator.model.effects.hypothesis import EQUAL, Context
 
 #: An error is said to be worse from this many times another one on.
 CLEARLY_WORSE = 1.05
@@ -28,6 +29,18 @@ def warnings_on(chosen: Deployment, *, deployed: bool) -> Iterator[Remark]:
     start_k = chosen.found.search.evidence.start_k
     for effect in chosen.effects:
         yield from _on_effect(effect, start_k)
+
+
+def ceiling_in_part(context: Context) -> list[Remark]:
+    """Return the remark that there are more channels than all together can be, where there are."""
+    kept, count = room_for_channels(context), len(context.channels)
+    if count <= kept:
+        return []
+    text = (
+        f"Only {kept} of {count} channels that move are in the ceiling and the remainder, those that are most like "
+        "what the model leaves; effects with a name were looked for in all."
+    )
+    return [Remark(ModelWarning.CEILING_IN_PART, text)]
 
 
 def _on_all(chosen: Deployment, *, deployed: bool) -> Iterator[Remark]:

@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose import diagnosis, held_out
+from compensator.codes import ModelWarning
+from compensator.diagnose import background, diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.summary import figures, verdict
 from compensator.model.model_file import load_model
-from tests.diagnose.scenarios import draw, record
+from tests.diagnose.scenarios import draw, lag, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -126,3 +127,20 @@ def test_a_record_of_an_hour_is_diagnosed(minutes, *, approximate):
     columns = {name: values[:minutes] for name, values in record([draw("input", 3, 5.0)], 80, 24.0)[0].items()}
     model = dataclasses.replace(QUILL, held_out_rms_um=0.6 if approximate else None)
     assert diagnose(model, runs_from(columns)).verdict
+
+
+def test_of_too_many_channels_those_like_the_residual_are_in_the_ceiling_and_it_says_so(monkeypatch):
+    """Of six channels four have room beside the inputs of the base: the last one acts, and is among them."""
+    columns, _, _ = record([], 60, 10.0)
+    names = [name for name in columns if name not in ("t_q_degc", "at_degc", "y_um")]
+    acting = lag(columns["spindle_rpm"] - columns["spindle_rpm"][0], 30.0)
+    rest = {name: columns[name] for name in columns if name != "spindle_rpm"}
+    y_um = columns["y_um"] + 3.0 * acting / np.std(acting)
+    data = runs_from(rest | {"y_um": y_um, "spindle_rpm": columns["spindle_rpm"]})
+    all_of_them = Background(evidence_of(QUILL, data)).template.channels
+    assert all_of_them[2:8] == tuple(name for name in (*rest, "spindle_rpm") if name in names)
+    monkeypatch.setattr(background, "MOST_CHANNELS", 6)
+    some = Background(evidence_of(QUILL, data)).template.channels
+    assert len(some) == 6 and some[-1] == "spindle_rpm" and list(some) == sorted(some, key=all_of_them.index)
+    [words] = [str(one) for one in diagnose(QUILL, data).warnings if one.code == ModelWarning.CEILING_IN_PART]
+    assert words.startswith("Only 4 of 6 channels")
