@@ -181,7 +181,7 @@ class Evidence:
     def _recordings(self, count: int) -> Iterator[Mask]:
         """Yield masks of groups of recordings with about equally many of the samples used."""
         numbers = np.repeat([run.recording for run in self.runs], [run.t_s.size for run in self.runs])
-        masks = [self.used & (numbers == number) for number in np.unique(numbers)]
+        masks = [self.used & (numbers == number) for number in np.unique(numbers[self.used])]
         groups = [np.zeros(self.used.size, dtype=bool) for _ in range(min(count, len(masks)))]
         for mask in sorted(masks, key=np.sum, reverse=True):
             smallest = min(range(len(groups)), key=lambda i: int(groups[i].sum()))

@@ -9,7 +9,7 @@ import compensator as tc
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.held_out import left_of_block, zeros_known
+from compensator.diagnose.held_out import how_held_out, left_of_block, zeros_known
 from compensator.diagnose.points import Points
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
@@ -39,6 +39,17 @@ def test_a_short_recording_beside_a_long_one_is_no_judge():
     assert not evidence.holds_out_recordings
     first = next(evidence.blocks(3))
     assert 0.3 < first.sum() / evidence.count < 0.4
+
+
+def test_a_recording_without_y_is_no_block():
+    """Nothing of it could be predicted, and a search without it has seen all that the blocks are predicted from."""
+    runs = recordings(10.0, 8.0, 6.0)[1]
+    runs[2] = dataclasses.replace(runs[2], y_um=np.full(runs[2].y_um.size, np.nan))
+    evidence = evidence_of(QUILL, runs)
+    assert [int(mask.sum()) for mask in evidence.blocks(3)] == [600, 480]
+    assert how_held_out(evidence).startswith("each of 2 recordings")
+    alone = evidence_of(QUILL, [runs[0], runs[2]])
+    assert not alone.holds_out_recordings and len(list(alone.blocks(3))) == 3
 
 
 def test_a_recording_does_not_foretell_itself():
