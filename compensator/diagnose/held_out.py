@@ -102,7 +102,10 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
         named=left["named"],
         whole=left["whole"],
         ceiling=left["ceiling"],
-        steps=tuple(Step(rms_um=rms_of(left[p]), searches=n) for p, n in zip(places, searches.tolist(), strict=True)),
+        steps=tuple(
+            Step(place=place, rms_um=rms_of(left[place]), searches=count)
+            for place, count in zip(places, searches.tolist(), strict=True)
+        ),
     )
 
 

@@ -12,7 +12,7 @@ from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.model.effects.hypothesis import EQUAL
+from compensator.model.effects.hypothesis import EQUAL, Place
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import ThermalModel
 
@@ -70,12 +70,15 @@ class Step:
 
     Parameters
     ----------
+    place : Place
+        Kind, path and channel of the effect.
     rms_um : float
         Residual on data that took no part, µm.
     searches : int
         How many of the searches without a block found the effect.
     """
 
+    place: Place
     rms_um: float
     searches: int
 
@@ -193,9 +196,10 @@ class Diagnosis:
         return self.evidence.at_rest == EQUAL or any(effect.term.hypothesis.rest == EQUAL for effect in self.effects)
 
     @property
-    def stepped(self) -> tuple[FoundEffect, ...]:
-        """The effects of `steps`: all but a late T_Q that is left in."""
-        return tuple(effect for effect in self.effects if not effect.left_in)
+    def stepped(self) -> tuple[tuple[FoundEffect, Step], ...]:
+        """The effects with their `steps`: a late T_Q that was left in has none."""
+        steps = {step.place: step for step in self.steps}
+        return tuple((effect, steps[effect.place]) for effect in self.effects if effect.place in steps)
 
     def _scores(self, residual: Vector) -> Scores:
         y = self.evidence.y_um

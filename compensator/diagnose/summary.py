@@ -394,8 +394,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     """Return the errors on held-out data before and after, and what they are compared with."""
     rows = [["base model", *diagnosis.before.cells()]]
     if len(diagnosis.effects) > 1:
-        pairs = zip(diagnosis.stepped, diagnosis.steps, strict=False)
-        rows += [[f"+ {name(effect)}", f"{step.rms_um:.2f}", "", ""] for effect, step in pairs]
+        rows += [[f"+ {name(effect)}", f"{step.rms_um:.2f}", "", ""] for effect, step in diagnosis.stepped]
     refused = " (not deployed)" if diagnosis.refused else ""
     if diagnosis.effects:
         named = diagnosis.named if diagnosis.remainder else diagnosis.found

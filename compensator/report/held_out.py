@@ -46,7 +46,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
             share, line = f"{share}, increased", _INCREASE
         bars.append(Bar(label, f"{last:.2f} µm ({share})", first, last, line, hatched=hatched))
 
-    for effect, step in zip(diagnosis.stepped, diagnosis.steps, strict=False):
+    for effect, step in diagnosis.stepped:
         add(_found_in(effect, step.searches, count), step.rms_um, _EFFECT)
     named = rms_of(diagnosis.held_out_named) if diagnosis.remainder else after
     if _differs(named, bars[-1].last):

@@ -21,7 +21,7 @@ from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Refused, Remainder, Step
 from compensator.diagnose.points import Points
-from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
+from compensator.diagnose.summary import contents, error_table, figures, headline, name, verdict
 from compensator.display import text_of_all
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of, tone_of
@@ -45,7 +45,7 @@ def found() -> Diagnosis:
     """A coolant and a step, in 10 h."""
     columns, _, _ = record([draw("input", 21), draw("step", 21)], 1121, 10.0)
     diagnosis = tc.diagnose("quill", {"t_s": 60.0 * np.arange(600), **columns}).diagnosis
-    assert len(diagnosis.effects) >= 1
+    assert len(diagnosis.effects) == 2
     return diagnosis
 
 
@@ -64,21 +64,27 @@ def sections(diagnosis: Diagnosis) -> list[Section]:
 # ---------------------------------------------------------------------------- waterfall
 
 
-def made(found: Diagnosis, before: float, named: float, after: float, steps: tuple[Step, ...], **changes: Any) -> Any:
-    """A diagnosis with errors of these sizes."""
+def made(
+    found: Diagnosis, before: float, named: float, after: float, steps: tuple[tuple[float, int], ...], **changes: Any
+) -> Any:
+    """A diagnosis with errors of these sizes; `steps`: of each effect the error with it, and how many searches."""
     one = np.ones(found.held_out_before.size)
+    effects = found.effects[: len(steps)]
     return dataclasses.replace(
         found,
         held_out_before=before * one,
         held_out_named=named * one,
         held_out_after=after * one,
-        steps=steps,
-        effects=tuple(found.effects[:1] * len(steps)),
+        steps=tuple(
+            Step(place=effect.place, rms_um=rms_um, searches=searches)
+            for effect, (rms_um, searches) in zip(effects, steps, strict=True)
+        ),
+        effects=effects,
         **changes,
     )
 
 
-STEPS = (Step(rms_um=3.0, searches=FOLDS), Step(rms_um=1.0, searches=2))
+STEPS = ((3.0, FOLDS), (1.0, 2))
 
 
 def test_each_bar_begins_where_the_one_above_ends_and_shares_of_the_squares_add_up(found: Diagnosis) -> None:
@@ -96,6 +102,14 @@ def test_each_bar_begins_where_the_one_above_ends_and_shares_of_the_squares_add_
     assert {edge.at for edge in picture.edges} == {(found.noise_floor_um,), (0.8,)}
 
 
+def test_an_effect_without_a_step_gets_none_of_another_one(found: Diagnosis) -> None:
+    """A late T_Q that was left in while the errors were measured, and in whose place all channels were put then."""
+    one = dataclasses.replace(made(found, 5.0, 1.0, 1.0, STEPS), steps=found.steps[1:])
+    second = name(found.effects[1])
+    assert [row[0] for row in error_table(one).rows if row[0].startswith("+ ")] == [f"+ {second}"]
+    assert waterfall(one).bars[1].name.startswith(second)
+
+
 def test_what_only_the_searches_found_is_a_bar_of_its_own(found: Diagnosis) -> None:
     picture = waterfall(made(found, 5.0, 2.0, 2.0, STEPS, remainder=None, ceiling=None))
     assert [bar.last for bar in picture.bars] == pytest.approx([5.0, 3.0, 1.0, 2.0, 2.0])
@@ -104,8 +118,7 @@ def test_what_only_the_searches_found_is_a_bar_of_its_own(found: Diagnosis) -> N
 
 
 def test_what_increases_the_error_has_its_own_colour_and_a_word(found: Diagnosis) -> None:
-    steps = (Step(rms_um=6.0, searches=1), Step(rms_um=1.0, searches=FOLDS))
-    picture = waterfall(made(found, 5.0, 1.0, 1.5, steps, remainder=REMAINDER, ceiling=None))
+    picture = waterfall(made(found, 5.0, 1.0, 1.5, ((6.0, 1), (1.0, FOLDS)), remainder=REMAINDER, ceiling=None))
     left, worse, better, _, remainder, _ = picture.bars
     assert worse.line == remainder.line and worse.line not in (left.line, better.line)
     assert [bar for bar in picture.bars if "increased" in bar.value] == [worse, remainder]
