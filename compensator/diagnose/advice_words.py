@@ -86,7 +86,7 @@ def _unexplained(found: Unexplained | None) -> dict[str, Any] | None:
         "rms_um": found.rms_um,
         "peak_to_peak_um": found.peak_to_peak_um,
         "tau_min": found.tau_min,
-        "when": [{"run": run, "hour": hour} for run, hour in found.times],
+        "when": [{"run": run + 1, "hour": hour} for run, hour in found.times],
         "goes_with": None if event is None else {"event": event.event, "times": event.times, "of": event.of},
         "sensor_evidence": found.sensor_evidence,
     }
