@@ -152,7 +152,7 @@ class Evidence:
     def blocks(self, count: int) -> Iterator[Mask]:
         """Yield masks of what is held out: whole recordings where there are several, or else blocks of time.
 
-        Of few values each takes every so many of them: a block of time would hold an event that the others lack.
+        Of few values in one recording each takes every so many: a block of time would hold an event that others lack.
 
         Parameters
         ----------

@@ -31,10 +31,9 @@ HELD_OUT_RECORDINGS = (
     "each of {count} recordings or groups of them predicted after choosing and fitting on the others; its zero is its "
     "own mean"
 )
-HELD_OUT_VALUES = (
-    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named "
-    "and deployed is decided by the likelihood of all values"
-)
+HELD_OUT_VALUES = f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others"
+#: Added where Y was measured now and then.
+BY_LIKELIHOOD = "; what is named and deployed is decided by the likelihood of all values"
 #: How the errors are measured where nothing was known of the paths.
 WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
 
@@ -182,5 +181,5 @@ def how_held_out(evidence: Evidence, beside: Sequence[str] = ()) -> str:
     words = HELD_OUT_VALUES if evidence.is_sparse else HELD_OUT
     if evidence.holds_out_recordings:
         words = HELD_OUT_RECORDINGS.format(count=count)
-    words += WITH_PATHS * evidence.free_paths
+    words += BY_LIKELIHOOD * evidence.is_sparse + WITH_PATHS * evidence.free_paths
     return words + (WITH_KINDS.format(kinds=listed(list(beside))) if beside else "")

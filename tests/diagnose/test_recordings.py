@@ -52,6 +52,19 @@ def test_a_recording_without_y_is_no_block():
     assert not alone.holds_out_recordings and len(list(alone.blocks(3))) == 3
 
 
+def test_recordings_of_probes_are_held_out_whole_and_the_likelihood_decides():
+    runs = [
+        dataclasses.replace(run, y_um=np.where(np.arange(run.y_um.size) % 30 == 29, run.y_um, np.nan), y_std_um=1.0)
+        for run in recordings(24.0, 24.0)[1]
+    ]
+    evidence = evidence_of(QUILL, runs)
+    assert evidence.is_sparse and [np.flatnonzero(mask)[0] for mask in evidence.blocks(3)] == [29, 1469]
+    words = how_held_out(evidence)
+    assert words.startswith("each of 2 recordings") and "decided by the likelihood of all values" in words
+    assert "likelihood" in how_held_out(evidence_of(QUILL, runs[:1]))
+    assert "likelihood" not in how_held_out(evidence_of(QUILL, recordings(10.0)[1]))
+
+
 def test_a_recording_does_not_foretell_itself():
     """Whatever Y is in the one that is held out, the same is predicted for it."""
     _, runs = recordings(10.0, 8.0, 9.0)
