@@ -1,8 +1,9 @@
 """The criterion of selection: the evidence of an explanation, less what naming its effects costs.
 
-    J = log p(residual | effects) − Σ_effects [ log M + margin ]
+    J = log p(residual | effects) − Σ_effects [ log(M + 1) + log f + margin ]
 
-with M places (and forms of a place) tried. The evidence counts everything else: parameters and amplitudes cost what
+with M places tried and f forms of a place. A source that no channel shows is charged more beside an approximate base,
+what another axis shows the margin alone. The evidence counts everything else: parameters and amplitudes cost what
 the data leave of their ranges, and what no effect explains is a slow rest and noise of learned size.
 """
 
