@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Likelihood, factor_of, learned_rest, solution
+from compensator.diagnose.likelihood import Likelihood, factor_of, factored, learned_rest, log_det_of, solution
 from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place, place_in_words
@@ -203,7 +203,7 @@ class _Problem:
         return found
 
     def solve(self, x: Vector) -> tuple[Vector, Vector, Matrix]:
-        """Return the residual with the amplitudes' prior, the amplitudes and their precision."""
+        """Return the residual with the amplitudes' prior, the amplitudes and the factor of their precision."""
         target, columns = self.likelihood.target, [np.zeros((self.likelihood.target.size, 0))]
         for part in self.parts(x):
             if part.scale is None:
@@ -211,9 +211,9 @@ class _Problem:
             else:
                 columns.append(part.projected)
         table = np.concatenate(columns, axis=1)
-        precision = np.eye(table.shape[1]) + table.T @ table
-        amplitudes = solution(factor_of(precision), table.T @ target) if table.shape[1] else np.zeros(0)
-        return np.concatenate([target - table @ amplitudes, -amplitudes]), amplitudes, precision
+        factor = factor_of(np.eye(table.shape[1]) + table.T @ table)
+        amplitudes = solution(factor, table.T @ target)
+        return np.concatenate([target - table @ amplitudes, -amplitudes]), amplitudes, factor
 
     def fun(self, x: Vector) -> Vector:
         return self.solve(x)[0]
@@ -254,12 +254,11 @@ def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: i
         # The solver stays inside: a dead time of a femtosecond is none.
         x = np.where(found.x - low < _AT_BOUND * ranges, low, found.x)
         jacobian = np.asarray(found.jac)[: likelihood.target.size]
-    residual, amplitudes, precision = problem.solve(x)
-    return _fitted(problem, x, (residual, amplitudes, precision), jacobian * ranges)
+    return _fitted(problem, x, problem.solve(x), jacobian * ranges)
 
 
 def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix], jacobian: Matrix) -> Fit:
-    likelihood, (residual, amplitudes, precision) = problem.likelihood, solved
+    likelihood, (residual, amplitudes, factor) = problem.likelihood, solved
     parts, rest = problem.parts(x), iter(amplitudes.tolist())
     terms, columns, fixed = [], [np.zeros((likelihood.points.count, 0))], np.zeros(likelihood.points.count)
     for hypothesis, part in zip(problem.hypotheses, parts, strict=True):
@@ -274,9 +273,9 @@ def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix],
         terms.append(Term(hypothesis=hypothesis, values=part.values, amplitudes=own))
     table = np.concatenate(columns, axis=1)
     # Laplace's approximation: how much of the range of each searched parameter the data leave.
-    searched = np.eye(jacobian.shape[1]) + jacobian.T @ jacobian / (2.0 * math.pi)
+    searched = factored(jacobian.T @ jacobian / (2.0 * math.pi))
     times = sum(len(getattr(h.effect, "times", ())) for h in problem.hypotheses)
-    surprise = float(residual @ residual) + likelihood.log_det + _log_det(precision) + _log_det(searched)
+    surprise = float(residual @ residual) + likelihood.log_det + log_det_of(factor) + log_det_of(searched)
     return Fit(
         terms=tuple(terms),
         likelihood=likelihood,
@@ -333,7 +332,3 @@ def to_search(free: Free, value: float) -> float:
 def from_search(free: Free, x: float) -> float:
     """Return a free parameter's own value."""
     return float(np.exp(x)) if free.log else x * (free.high - free.low)
-
-
-def _log_det(matrix: Matrix) -> float:
-    return float(np.linalg.slogdet(matrix)[1])
