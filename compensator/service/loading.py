@@ -198,12 +198,19 @@ def _fleet(path: str, config: Config) -> drivers.Fleet:
     expected_units = {"t_q_degc": "degc", "at_degc": "degc", "y_um": "um"}
     if config.axis is not None:
         expected_units |= {column_of(axis): "um" for axis in config.axis.linear()}
+    owners: dict[tuple[str, int], str] = {}
     for channel in config.channel:
         units = fleet.devices[channel.device].units
         if channel.input not in units:
             raise ConfigError(
                 f"{path}: channel {channel.name!r}: input {channel.input} of device {channel.device!r} is not "
                 f"configured, expected one of: {', '.join(map(str, sorted(units)))}"
+            )
+        # Only here, and not in `parse_config`: recordings of such a machine can still be audited.
+        if (owner := owners.setdefault((channel.device, channel.input), channel.name)) != channel.name:
+            raise ConfigError(
+                f"{path}: channel {channel.name!r}: input {channel.input} of device {channel.device!r} is that of "
+                f"channel {owner!r}, expected one of its own"
             )
         unit, expected = units[channel.input], expected_units.get(channel.name)
         if expected is not None and unit != expected:

@@ -300,6 +300,12 @@ BAD_CONFIGS = [
     ('name = "coolant_degc"', 'name = "y_pred_um"', "channel 'y_pred_um': `export` writes another column of this name"),
     ('name = "coolant_degc"', 'name = "time_utc"', "channel 'time_utc': `export` writes another column of this name"),
     ('name = "coolant_degc"', 'name = "t_q_degc_quality"', "channel 't_q_degc_quality': `export` writes another"),
+    (
+        'device = "cabinet-thermocouples"\ninput = 0',
+        'device = "spindle-thermocouples"\ninput = 0',
+        "channel 'at_degc': input 0 of device 'spindle-thermocouples' is that of channel 't_q_degc', expected one",
+    ),
+    ('device = "control"\ninput = 1', 'device = "control"\ninput = 0', "'control' is that of channel 'spindle_rpm'"),
     (LISTEN, LISTEN.replace(":7447", ""), "zenoh.listen[0] = 'tcp/127.0.0.1': expected such as tcp/127.0.0.1:7447 or"),
     (LISTEN, LISTEN.replace("tcp/", ""), "zenoh.listen[0] = '127.0.0.1:7447': expected such as"),
     (LISTEN, LISTEN.replace("7447", "99999"), "with a port up to 65535"),
