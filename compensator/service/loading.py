@@ -34,6 +34,9 @@ log = logging.getLogger("compensator")
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _BY_ID = Path("/dev/serial/by-id")
 
+#: Units of channels: where its name ends in one and its input gives another one, a model would get wrong values.
+_UNITS = frozenset({"degc", "degf", "k", "um", "mm", "v", "rpm", "w", "kw", "lpm", "bar", "pct"})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
@@ -212,8 +215,9 @@ def _fleet(path: str, config: Config) -> drivers.Fleet:
                 f"{path}: channel {channel.name!r}: input {channel.input} of device {channel.device!r} is that of "
                 f"channel {owner!r}, expected one of its own"
             )
-        unit, expected = units[channel.input], expected_units.get(channel.name)
-        if expected is not None and unit != expected:
+        unit, suffix = units[channel.input], channel.name.rpartition("_")[2]
+        expected = expected_units.get(channel.name, suffix if {suffix, unit} <= _UNITS else None)
+        if expected not in (None, unit):
             raise ConfigError(f"{path}: channel {channel.name!r}: its input gives {unit}, expected {expected}")
     return fleet
 

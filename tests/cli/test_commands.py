@@ -306,6 +306,9 @@ BAD_CONFIGS = [
         "channel 'at_degc': input 0 of device 'spindle-thermocouples' is that of channel 't_q_degc', expected one",
     ),
     ('device = "control"\ninput = 1', 'device = "control"\ninput = 0', "'control' is that of channel 'spindle_rpm'"),
+    ('unit = "rpm"', 'unit = "v"', "channel 'spindle_rpm': its input gives v, expected rpm"),
+    ('1, unit = "degc"', '1, unit = "degf"', "channel 'coolant_degc': its input gives degf, expected degc"),
+    ('name = "base_degc"', 'name = "z_um"', "channel 'z_um': its input gives degc, expected um"),
     (LISTEN, LISTEN.replace(":7447", ""), "zenoh.listen[0] = 'tcp/127.0.0.1': expected such as tcp/127.0.0.1:7447 or"),
     (LISTEN, LISTEN.replace("tcp/", ""), "zenoh.listen[0] = '127.0.0.1:7447': expected such as"),
     (LISTEN, LISTEN.replace("7447", "99999"), "with a port up to 65535"),
@@ -365,6 +368,17 @@ def test_bad_configurations_get_one_line_and_exit_2(
     assert main(["check", "--config", str(tmp_path / "bad.toml")]) == 2
     error = capsys.readouterr().err
     assert expected in error and "bad.toml" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"spindle_rpm"', '"pump_on"'), ('unit = "rpm"', 'unit = "hz"'), ('"base_degc"', '"bed"')]
+)
+def test_a_channel_whose_name_or_input_states_no_known_unit_is_taken(tmp_path: Path, old: str, new: str) -> None:
+    lines = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 10001, "command": 10023}
+    text = configuration("vmc-07", lines, 7447)
+    assert old in text
+    (tmp_path / "m.toml").write_text(text.replace(old, new, 1))
+    assert main(["check", "--config", str(tmp_path / "m.toml")]) == 0
 
 
 def test_two_devices_on_one_address_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
