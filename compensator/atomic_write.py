@@ -100,7 +100,9 @@ def _require_regular(path: Path) -> None:
         raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
-def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True) -> None:
+def replace_file(
+    path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True, owner: tuple[int, int] | None = None
+) -> None:
     """Replace a file; a link is replaced, not followed.
 
     Parameters
@@ -113,6 +115,8 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
         Its permissions, before the umask.
     sync : bool
         Whether to sync the file and its name to disk, so that a power cut leaves the old file or the new one.
+    owner : (int, int), optional
+        User and group to whom root gives it; it then has the permissions `mode` whatever the umask.
 
     Raises
     ------
@@ -123,11 +127,44 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
         _require_regular(path)
     with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
         file.write(data)
+        if owner is not None:
+            os.fchown(descriptor, *owner)
+            os.fchmod(descriptor, mode)
         if sync:
             file.flush()
             os.fsync(descriptor)
     if sync:
         sync_folder(path.parent)
+
+
+def make_folder(folder: Path) -> tuple[int, int] | None:
+    """Make a folder and those above it that do not exist.
+
+    Returns
+    -------
+    (int, int) or None
+        Where root writes into it, user and group to whom it belongs: those of the lowest folder that was there, to whom
+        new ones are given. A service that is not root's could not go on with what is root's.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    """
+    if os.geteuid() != 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        return None
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    found = (missing[-1].parent if missing else folder).stat()
+    for one in reversed(missing):
+        one.mkdir()
+        descriptor = os.open(one, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            os.fchown(descriptor, found.st_uid, found.st_gid)
+            os.fchmod(descriptor, 0o755)
+        finally:
+            os.close(descriptor)
+    return found.st_uid, found.st_gid
 
 
 def sync_folder(folder: Path) -> None:

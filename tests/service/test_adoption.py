@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import os
+import stat
 import threading
 import time
 from collections.abc import Callable
@@ -507,6 +509,24 @@ def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp
     with pytest.raises(ServiceError, match="a folder of its own"):
         other.adopt(STRONGER, name="stronger", time_utc_ns=5)
     assert store.in_use() == WITH_INPUT
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_what_root_stores_belongs_to_the_user_of_the_service(tmp_path: Path, umask: int) -> None:
+    recordings = tmp_path / "recordings"
+    os.chown(tmp_path, 65534, 65533)
+    before = os.umask(umask)
+    try:
+        ModelStore(recordings / "models", QUILL, MACHINE).adopt(STRONGER, name="stronger", time_utc_ns=1)
+    finally:
+        os.umask(before)
+    written = [recordings, recordings / "models", *(recordings / "models").iterdir()]
+    assert len(written) == 4
+    for path in written:
+        status = path.stat()
+        assert (status.st_uid, status.st_gid) == (65534, 65533), path
+        assert stat.S_IMODE(status.st_mode) == (0o755 if path.is_dir() else 0o644), path
 
 
 async def test_couples_that_a_person_has_put_right_are_no_fault_of_a_model_adopted_afterwards(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from compensator.atomic_write import replace_file
+from compensator.atomic_write import make_folder, replace_file
 from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError, ServiceError
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
@@ -188,8 +188,9 @@ class ModelStore:
     def _store(self, name: str, data: bytes) -> None:
         path = self.folder / name
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            replace_file(path, data)
+            # `adopt` by root, beside a service that is stopped.
+            owner = make_folder(self.folder)
+            replace_file(path, data, mode=0o644, owner=owner)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}; the model is not stored") from error
 
