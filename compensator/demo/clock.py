@@ -40,7 +40,6 @@ class LateClock:
         self._late = behind_s > 0
         self._on_advance = on_advance
         self._on_time = on_time
-        self._woken = asyncio.Event()
 
     def utc_ns(self) -> int:
         """Return the wall clock, or the simulated time until it has caught up, ns since 1970 UTC."""
@@ -55,10 +54,6 @@ class LateClock:
         """Time that it is behind the present, s; 0 once it has caught up."""
         return (self._wall.monotonic_ns() - self._now_ns) / NS if self._late else 0.0
 
-    def wake(self) -> None:
-        """End the current sleep and every later one at once, to stop."""
-        self._woken.set()
-
     async def sleep(self, seconds: float) -> None:
         """Jump ahead, or wait once it has caught up."""
         ahead_ns = round(max(seconds, 0.0) * NS)
@@ -72,10 +67,7 @@ class LateClock:
             ahead_ns -= now_ns - self._now_ns
             self._late = False
             self._on_time()
-        waits = [asyncio.ensure_future(self._wall.sleep(ahead_ns / NS)), asyncio.ensure_future(self._woken.wait())]
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-        for wait in waits:
-            wait.cancel()
+        await self._wall.sleep(ahead_ns / NS)
         await self._on_advance(self.monotonic_ns() / NS)
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:

@@ -26,7 +26,6 @@ from compensator.demo.loop import EFFECT_UM
 from compensator.demo.machine import MACHINES, Hardware, configuration, hardware
 from compensator.errors import UsageError
 from compensator.service.composition import run_service
-from compensator.service.daemon import Daemon
 from compensator.service.loading import load
 from compensator.service.presence import sole_user
 from sim_hardware.physics import Duty, World, draw_effect, usual_sensors
@@ -141,16 +140,12 @@ async def _serve(
             threading.Thread(target=_read_commands, args=(typed, devices.faults), daemon=True).start()
 
         clock = LateClock(hours * 3600.0, advance, on_time)
-
-        def ready(daemon: Daemon) -> None:
-            def stop() -> None:
-                daemon.stop()
-                clock.wake()
-
-            on_stop(stop)
-
-        setup = load(str(config))
-        await run_service(setup, clock=clock, on_ready=ready, publishes=lambda: clock.behind_s < PRESENT_S)
+        await run_service(
+            load(str(config)),
+            clock=clock,
+            on_ready=lambda daemon: on_stop(daemon.stop),
+            publishes=lambda: clock.behind_s < PRESENT_S,
+        )
 
 
 def _explain(out: Path, config: Path, port: int) -> None:

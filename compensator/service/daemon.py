@@ -153,6 +153,8 @@ class Daemon:
         self._deciding: list[ReceivedProbe] = []
         self._unread: list[Probe] = []
         self._stop = False
+        #: The sleep until the next poll.
+        self._sleep: asyncio.Future[None] | None = None
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
         #: Outcomes that were published but not yet reported to the caller.
@@ -197,7 +199,7 @@ class Daemon:
         done = 0
         try:
             while not self._stop and (samples is None or done < samples):
-                await self._clock.sleep(grid.seconds_to_next_poll())
+                await self._sleep_until_stopped(grid.seconds_to_next_poll())
                 if self._stop:
                     break
                 if await self._began_again(grid):
@@ -214,6 +216,16 @@ class Daemon:
         finally:
             await self._close()
             self._report(on_sample)
+
+    async def _sleep_until_stopped(self, seconds: float) -> None:
+        """Wait for the next poll, which may be an hour away, or for `stop`: a service manager kills what takes long."""
+        self._sleep = asyncio.ensure_future(self._clock.sleep(seconds))
+        try:
+            await asyncio.wait([self._sleep])
+            if not self._sleep.cancelled():
+                self._sleep.result()
+        finally:
+            self._sleep.cancel()
 
     async def _began_again(self, grid: Grid) -> bool:
         """Follow a wall clock that was set, and account for samples while nothing ran; return whether that was so."""
@@ -283,8 +295,10 @@ class Daemon:
         return self._journal.unfinished
 
     def stop(self) -> None:
-        """End the run after the current poll; the recording is finished."""
+        """End the run, after the poll that is under way; the recording is finished."""
         self._stop = True
+        if self._sleep is not None:
+            self._sleep.cancel()
 
     async def _close(self) -> None:
         self.stop()

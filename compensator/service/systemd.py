@@ -17,6 +17,8 @@ from collections.abc import Mapping
 
 #: Polls that may be missed before the manager considers the service stuck.
 POLLS_TO_MISS = 3
+#: Longest time between two polls for which the time limit of a start in the unit is made, s.
+LONGEST_START_S = 60.0
 
 
 class ServiceManager:
@@ -48,7 +50,7 @@ class ServiceManager:
         self.watchdog_s = int(microseconds) / 1e6 if address and for_us and microseconds.isdecimal() else None
 
     def watch(self, poll_interval_s: float) -> None:
-        """Extend the watchdog's time for slow polls; never shorten it.
+        """Extend the time limits of the start and of the watchdog for slow polls; never shorten them.
 
         Parameters
         ----------
@@ -56,6 +58,8 @@ class ServiceManager:
             Time between two calls of `alive`, s.
         """
         needed_s = POLLS_TO_MISS * poll_interval_s
+        if poll_interval_s > LONGEST_START_S:
+            self._send_surely(f"EXTEND_TIMEOUT_USEC={round(needed_s * 1e6)}")
         if self.watchdog_s is not None and self.watchdog_s < needed_s:
             self.watchdog_s = needed_s
             self._send_surely(f"WATCHDOG_USEC={round(needed_s * 1e6)}")

@@ -67,20 +67,6 @@ async def test_once_on_time_it_goes_with_a_wall_clock_that_is_set() -> None:
     assert clock.utc_ns() == START_NS + 3601 * NS and clock.monotonic_ns() == NS
 
 
-async def test_a_sleep_ends_when_somebody_wakes_it() -> None:
-    class Endless(Wall):
-        async def sleep(self, seconds: float) -> None:
-            await asyncio.Event().wait()
-
-    clock, advanced, _ = late(0.0, Endless())
-    sleeper = asyncio.create_task(clock.sleep(1e6))
-    await asyncio.sleep(0)
-    clock.wake()
-    await sleeper
-    await clock.sleep(1e6)
-    assert len(advanced) == 2
-
-
 async def test_what_does_not_end_is_waited_for_in_the_past_only() -> None:
     clock, _, _ = late(10.0, Wall())
     never = asyncio.get_running_loop().create_future()

@@ -106,12 +106,15 @@ def test_the_manager_is_told_in_its_own_protocol(listener: Listener) -> None:
         manager.alive()
         manager.watch(5.0)
         manager.watch(60.0)
+        manager.watch(600.0)
         manager.stopping()
     assert listener.drain() == [
         "STATUS=one line only",
         "READY=1",
         "WATCHDOG=1",
         "WATCHDOG_USEC=180000000",
+        "EXTEND_TIMEOUT_USEC=1800000000",
+        "WATCHDOG_USEC=1800000000",
         "STOPPING=1",
     ]
 

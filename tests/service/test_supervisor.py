@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,37 @@ async def test_a_sample_that_breaks_off_half_way_leaves_a_recording_that_audits_
     assert [o.seq for o in offsets] == list(range(40))
     assert all(o.state == "hold" and "internal_error" in o.reasons for o in offsets[20:23])
     assert {o.y_offset_um for o in offsets[20:23]} == {offsets[19].y_offset_um}
+
+
+async def test_a_stop_ends_the_wait_for_the_next_poll(bench: Bench, tmp_path: Path) -> None:
+    """Polls may be an hour apart, and a service manager kills what has not ended after 90 s."""
+    waits = asyncio.Event()
+
+    async def endless(seconds: float) -> None:
+        waits.set()
+        await asyncio.get_running_loop().create_future()
+
+    bench.daemon._clock = _Sleeper(bench.clock, endless)
+    run = asyncio.create_task(bench.daemon.run())
+    await waits.wait()
+    bench.daemon.stop()
+    await asyncio.wait_for(run, 10.0)
+    (file,) = recordings(tmp_path / "rec", "vmc-07")
+    assert file.read_bytes().endswith(b"\x89MCAP0\r\n")
+
+
+async def test_a_stop_within_a_poll_lets_its_sample_end(bench: Bench) -> None:
+    read, polls = bench.device.read, 0
+
+    async def stopping() -> Mapping[int, Reading]:
+        nonlocal polls
+        polls += 1
+        if polls == 12:
+            bench.daemon.stop()
+        return await read()
+
+    bench.device.read = stopping  # type: ignore[method-assign]
+    assert len(await bench.run(5)) == 2 and polls == 12
 
 
 class _Sleeper:
