@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import socket
 import struct
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 
 #: Polls that may be missed before the manager considers the service stuck.
 POLLS_TO_MISS = 3
@@ -180,16 +182,28 @@ class JournalHandler(logging.Handler):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send one record without blocking; a record that the journal refuses is written to stderr."""
-        text = self.format(record)
-        priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
-        fields = {"MESSAGE": text, "PRIORITY": priority, "SYSLOG_IDENTIFIER": "compensator", "LOGGER": record.name}
+        """Send one record without blocking; one that the journal refuses goes to stderr, if that takes it at once."""
         try:
-            self._socket.sendto(datagram(fields | getattr(record, "fields", {})), socket.MSG_DONTWAIT, self._address)
-        except OSError:
-            sys.stderr.write(text + "\n")
+            text = self.format(record)
+            priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
+            fields = {"MESSAGE": text, "PRIORITY": priority, "SYSLOG_IDENTIFIER": "compensator", "LOGGER": record.name}
+            data = datagram(fields | getattr(record, "fields", {}))
+            try:
+                self._socket.sendto(data, socket.MSG_DONTWAIT, self._address)
+            except OSError:
+                _to_stderr(text)
+        except Exception:  # noqa: BLE001  as every handler: a wrong line must not end the service
+            self.handleError(record)
 
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
         super().close()
+
+
+def _to_stderr(text: str) -> None:
+    """Write a line to stderr, unless it is closed or nobody reads it: a write to a full pipe waits for its reader."""
+    with suppress(OSError, ValueError):
+        stream = sys.stderr.fileno()
+        if select.select([], [stream], [], 0.0)[1]:
+            os.write(stream, text.encode("utf-8", "replace")[: select.PIPE_BUF - 1] + b"\n")

@@ -303,11 +303,39 @@ def test_events_reach_the_journal_with_their_fields(tmp_path: Path, listener: Li
     assert second["MESSAGE"] == "device: two\nlines" and second["STATE"] == "hold" and second["PRIORITY"] == "6"
 
 
-def test_a_journal_that_is_gone_loses_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def refused(tmp_path: Path) -> Iterator[Callable[..., None]]:
+    """What logs a line while nobody is at the journal's socket."""
     handler = systemd.JournalHandler(str(tmp_path / "nobody"))
-    handler.emit(logging.LogRecord("compensator", logging.INFO, "", 0, "still said", (), None))
+    yield lambda *words: handler.emit(logging.LogRecord("compensator", logging.INFO, "", 0, words[0], words[1:], None))
     handler.close()
-    assert capsys.readouterr().err == "still said\n"
+
+
+def test_a_journal_that_is_gone_loses_no_line(refused: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
+    refused("still said")
+    assert capfd.readouterr().err == "still said\n"
+    refused("%d µm", 3)
+    refused("µ" * 9000)
+    assert capfd.readouterr().err.startswith("3 µm\n" + "µ" * 2000)
+    refused("%d", "no number")
+    assert "--- Logging error ---" in capfd.readouterr().err
+
+
+def test_a_stream_that_nobody_reads_neither_blocks_a_line_nor_ends_the_service(
+    refused: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, write = os.pipe()
+    with os.fdopen(write, "w", buffering=1) as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        logging_all = threading.Thread(target=lambda: [refused("x" * 100) for _ in range(3000)], daemon=True)
+        logging_all.start()
+        logging_all.join(60.0)
+        blocked = logging_all.is_alive()
+        os.close(read)
+        logging_all.join(60.0)
+        assert not blocked
+        refused("to a broken pipe")
+    refused("to a closed stream")
 
 
 def test_only_the_stream_that_systemd_names_is_the_journal(tmp_path: Path) -> None:
