@@ -376,27 +376,32 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
     folder = installation.path(CONFIGURATIONS) / given.name
     folder.mkdir(parents=True, exist_ok=True)
     system.own(folder, 0o750)
-    for source, name in ((given.config, "machine.toml"), *((path, path.name) for path in given.model)):
-        if source is not None:
-            _copy(source, folder / name, system)
+    if given.config is not None:
+        _copy(given.config, folder / "machine.toml", system)
+    if older := [path.name for path in given.model if not _copy(path, folder / path.name, system)]:
+        raise InstallError(
+            f"{folder / older[0]}: not the one given: move {older[0]}.new over it, or give the new one another name"
+        )
     if not (folder / "machine.toml").exists():
         raise InstallError(f"{folder / 'machine.toml'}: missing, expected --config FILE")
     installation.check(version, folder / "machine.toml")
     system.enable(f"compensator@{given.name}.service")
 
 
-def _copy(source: Path, target: Path, system: System) -> None:
+def _copy(source: Path, target: Path, system: System) -> bool:
+    """Copy a file to where there is none; return whether it is there now."""
     data = read(source)
     if target.exists() and read(target) != data:
         newer = target.with_name(target.name + ".new")
         newer.write_bytes(data)
         system.own(newer, 0o640)
         report(f"{target}: differs and stays; the new one is {newer.name}")
-        return
+        return False
     if not target.exists():
         target.write_bytes(data)
         report(f"{target}: written")
     system.own(target, 0o640)
+    return True
 
 
 def back(given: argparse.Namespace, installation: Installation, system: System) -> None:

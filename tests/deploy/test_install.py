@@ -244,6 +244,24 @@ def test_a_configuration_is_never_overwritten(pc: Pc) -> None:
     assert b"# second" in config.with_name("machine.toml.new").read_bytes()
 
 
+def test_another_model_of_the_same_name_is_a_failure_that_says_what_to_do(pc: Pc, tmp_path: Path) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    folder = pc.machine("").parent
+    given = argparse.Namespace(name="vmc-07", config=None, model=[tmp_path / "a.toml", tmp_path / "b.toml"])
+    for path in given.model:
+        path.write_text("first\n")
+    for _ in range(2):  # the same again is as once
+        install.machine(given, pc.installation, pc.system)
+    pc.system.units.clear()
+    given.model[0].write_text("second\n")
+    with pytest.raises(install.InstallError, match=r"vmc-07/a\.toml: not the one given: move a\.toml\.new over it"):
+        install.machine(given, pc.installation, pc.system)
+    assert pc.system.units == [] and (folder / "a.toml").read_text() == "first\n"
+    (folder / "a.toml.new").replace(folder / "a.toml")
+    install.machine(given, pc.installation, pc.system)
+    assert (folder / "a.toml").read_text() == "second\n" and len(pc.system.units) == 1
+
+
 @pytest.mark.parametrize(
     "folder", ["recordings", "/data", "/var/lib/compensator/other/recordings", "/var/lib/compensator/vmc-07/../other"]
 )
