@@ -26,6 +26,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import stat
@@ -51,6 +52,8 @@ JOURNAL_LIMITS = {"systemd/journald.conf": "/etc/systemd/journald.conf.d/compens
 COMMAND = "/usr/local/bin/compensator"
 #: Largest file that is read, bytes: a wheel, and anything else.
 WHEEL_BYTES, FILE_BYTES = 100_000_000, 1_000_000
+#: Names of machines, which are names of folders and units.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 UNITS = ("compensator-router.service", "compensator@*.service")
 
 
@@ -161,16 +164,14 @@ class Installation:
         if found == digest:
             return
         if found is not None and found not in known.get(place, []):
-            newer.write_bytes(data)
+            put(newer, data)
             report(f"{path}: was changed here and stays; the new one is {newer.name}")
             return
         # Recorded before it is written: a power cut in between leaves no file without an owner.
         known[place] = [*known.get(place, []), digest]
         self._manifest.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name("." + path.name + ".part")
-        part.write_bytes(data)
-        part.replace(path)
+        put(path, data)
         newer.unlink(missing_ok=True)
         report(f"{path}: written")
 
@@ -222,6 +223,14 @@ class Installation:
                 f"{config}: recording.folder = {table['recording']['folder']!r}, expected a folder below "
                 f"{RECORDINGS}/{name}/, the only place that the service may write to"
             )
+        for kind, key in (("model", "store"), ("recording", "head")):
+            given = table.get(kind, {}).get(key)
+            place = os.path.normpath(Path(CONFIGURATIONS) / name / given) if given else ""
+            if place.startswith(f"{CONFIGURATIONS}/"):
+                raise InstallError(
+                    f"{config}: {kind}.{key} = {given!r}, expected a place below {RECORDINGS}/{name}/: below "
+                    f"{CONFIGURATIONS} the service may not write"
+                )
         report(f"{config}: valid for {version.name}")
 
     def activate(self, version: Path, system: System, *, journal_limits: bool = False) -> None:
@@ -373,6 +382,10 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
     version = installation.link("current")
     if version is None:
         raise InstallError(f"{installation.root}: nothing is installed, expected `install.py install` first")
+    if NAME.fullmatch(given.name) is None:
+        raise InstallError(f"machine {given.name!r}: expected letters, digits, . _ -, such as vmc-07")
+    if given.config is not None and (other := _name_in(given.config)) not in (None, given.name):
+        raise InstallError(f"{given.config}: machine.name = {other!r}, expected {given.name!r}")
     folder = installation.path(CONFIGURATIONS) / given.name
     folder.mkdir(parents=True, exist_ok=True)
     system.own(folder, 0o750)
@@ -388,17 +401,26 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
     system.enable(f"compensator@{given.name}.service")
 
 
+def _name_in(config: Path) -> object:
+    """Return the name of the machine in a configuration; None where `check` will say what is wrong with it."""
+    try:
+        table = tomllib.loads(read(config).decode("utf-8-sig")).get("machine")
+    except ValueError:
+        return None
+    return table.get("name") if isinstance(table, dict) else None
+
+
 def _copy(source: Path, target: Path, system: System) -> bool:
     """Copy a file to where there is none; return whether it is there now."""
     data = read(source)
     if target.exists() and read(target) != data:
         newer = target.with_name(target.name + ".new")
-        newer.write_bytes(data)
+        put(newer, data)
         system.own(newer, 0o640)
         report(f"{target}: differs and stays; the new one is {newer.name}")
         return False
     if not target.exists():
-        target.write_bytes(data)
+        put(target, data)
         report(f"{target}: written")
     system.own(target, 0o640)
     return True
@@ -431,6 +453,16 @@ def uninstall(given: argparse.Namespace, installation: Installation, system: Sys
         system.remove_user()
         report("configuration, recordings, logs and user: removed")
     system.forget()
+
+
+def put(path: Path, data: bytes) -> None:
+    """Write a file that is never half there: the same command would take it for one that was changed here."""
+    part = path.with_name(f".{path.name}.part")
+    with part.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
 
 
 def read(path: Path, most: int = FILE_BYTES) -> bytes:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import os
+import re
+import resource
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -119,12 +121,12 @@ class Pc:
     def activate(self, version: Path, **options: Any) -> None:
         self.installation.activate(version, self.system, **options)
 
-    def machine(self, text: str, folder: str = "/var/lib/compensator/vmc-07/recordings") -> Path:
+    def machine(self, text: str, folder: str = "/var/lib/compensator/vmc-07/recordings", name: str = "vmc-07") -> Path:
         source = self.folder / "given.toml"
         source.write_text(f'{text}\n[recording]\nfolder = "{folder}"\n')
-        given = argparse.Namespace(name="vmc-07", config=source, model=[])
+        given = argparse.Namespace(name=name, config=source, model=[])
         install.machine(given, self.installation, self.system)
-        return self.folder / "etc/compensator/vmc-07/machine.toml"
+        return self.folder / "etc/compensator" / name / "machine.toml"
 
     def uninstall(self, *, purge: bool) -> None:
         install.uninstall(argparse.Namespace(purge=purge), self.installation, self.system)
@@ -270,6 +272,63 @@ def test_a_recording_that_the_service_could_not_write_is_refused(pc: Pc, folder:
     with pytest.raises(install.InstallError, match="expected a folder below /var/lib/compensator/vmc-07/"):
         pc.machine("", folder)
     assert pc.system.units == []
+
+
+def test_a_write_that_was_cut_off_is_made_good_by_the_same_command(pc: Pc) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    text = "# a line of a configuration\n" * 200
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    source = pc.folder / "given.toml"
+    source.write_text(text + 'recording.folder = "/var/lib/compensator/vmc-07/recordings"\n')
+    given = argparse.Namespace(name="vmc-07", config=source, model=[])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            install.machine(given, pc.installation, pc.system)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    install.machine(given, pc.installation, pc.system)
+    assert (pc / "etc/compensator/vmc-07/machine.toml").read_bytes() == source.read_bytes()
+
+
+def test_the_configuration_of_another_machine_is_refused_and_not_copied(pc: Pc) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    with pytest.raises(install.InstallError, match=r"given\.toml: machine\.name = 'vmc-08', expected 'vmc-07'"):
+        pc.machine('[machine]\nname = "vmc-08"')
+    assert not (pc / "etc").exists() and pc.system.units == []
+    pc.machine('[machine]\nname = "vmc-07"')
+    assert pc.system.units == ["compensator@vmc-07.service"]
+
+
+@pytest.mark.parametrize(
+    ("table", "refused"),
+    [
+        ('[model]\nstore = "models"', "model.store = 'models', expected a place below /var/lib/compensator/vmc-07/"),
+        ('[model]\nstore = "/var/lib/compensator/vmc-07/models"', None),
+        ('recording.head = "vmc-07.head.json"', "recording.head = 'vmc-07.head.json', expected a place"),
+        ('recording.head = "/etc/compensator/../compensator/head.json"', "expected a place"),
+        ('recording.head = "/srv/heads/vmc-07.head.json"', None),
+    ],
+)
+def test_what_the_service_writes_is_not_below_its_configuration(pc: Pc, table: str, refused: str | None) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    source = pc.folder / "given.toml"
+    source.write_text(f'recording.folder = "/var/lib/compensator/vmc-07/recordings"\n{table}\n')
+    given = argparse.Namespace(name="vmc-07", config=source, model=[])
+    if refused is None:
+        install.machine(given, pc.installation, pc.system)
+        return
+    with pytest.raises(install.InstallError, match=re.escape(refused)):
+        install.machine(given, pc.installation, pc.system)
+    assert pc.system.units == []
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../../tmp/x", "vmc 07", "-x", "a/b", "x" * 65])
+def test_a_name_that_is_no_folder_is_refused(pc: Pc, name: str) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    with pytest.raises(install.InstallError, match="expected letters, digits"):
+        pc.machine("", name=name)
+    assert not (pc / "etc").exists()
 
 
 def test_a_configuration_may_begin_with_a_byte_order_mark(pc: Pc) -> None:
