@@ -138,14 +138,32 @@ def _did_you_mean(word: str, names: Sequence[str]) -> str:
     return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
+class _Once(argparse._StoreAction):
+    """Stores the value of an option, which may be given once: of two machines' files one would silently be left out."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Store it."""
+        if option_string is not None and self.dest in parser.given:
+            parser.error(f"argument {'/'.join(self.option_strings)}: given twice, expected once")
+        parser.given.add(self.dest)
+        super().__call__(parser, namespace, values, option_string)
+
+
 class _Parser(argparse.ArgumentParser):
     """Argument parser that reports wrong usage in one line, like every other error."""
 
     _words: Sequence[str] = ()
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.register("action", None, _Once)
+        #: Options that were given so far.
+        self.given: set[str] = set()
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Keep the words, so that an error can name an option that was mistyped."""
         self._words = sys.argv[1:] if args is None else args
+        self.given.clear()
         return super().parse_known_args(args, namespace)
 
     def _print_message(self, message: str, file: Any = None) -> None:

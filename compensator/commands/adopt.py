@@ -33,7 +33,7 @@ def adopt(arguments: argparse.Namespace) -> Answer:
         raise UsageError("expected either MODEL, or --candidate for the model that the service proposes")
     setup = load(arguments.config)
     if arguments.candidate is not None:
-        wanted = {"candidate": True, "force": arguments.force, "sha256": arguments.candidate}
+        wanted = {"candidate": True, "force": arguments.force, "sha256": _hash_of(arguments)}
         return _decide(CommandName.ADOPT, wanted, setup, arguments)
     data = read_model_bytes(arguments.model)
     model = check_model(setup.config, data, source=arguments.model)
@@ -79,7 +79,12 @@ def dismiss(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the configuration cannot be used, or the service is not reached or refuses.
     """
-    return _decide(CommandName.DISMISS, {"sha256": arguments.candidate}, load(arguments.config), arguments)
+    return _decide(CommandName.DISMISS, {"sha256": _hash_of(arguments)}, load(arguments.config), arguments)
+
+
+def _hash_of(arguments: argparse.Namespace) -> str:
+    """Return the beginning of the candidate's hash; empty: whichever is proposed."""
+    return "" if arguments.candidate is True else str(arguments.candidate)
 
 
 def _decide(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> Answer:

@@ -26,8 +26,8 @@ _SCHEDULER = "run on this Dask scheduler, such as tcp://host:8786 (default: all 
 
 
 def _hash(text: str) -> str:
-    """Read the beginning of a hash; empty: whichever there is."""
-    if re.fullmatch("([0-9a-f]{6,64})?", text) is None:
+    """Read the beginning of a hash."""
+    if re.fullmatch("[0-9a-f]{6,64}", text) is None:
         raise argparse.ArgumentTypeError(f"{text!r}: expected the first 6 or more digits of a hash, such as 055e0d2a")
     return text
 
@@ -272,14 +272,14 @@ def adopt(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `adopt`."""
     parser.add_argument("model", type=_READ_TEXT, nargs="?", metavar="MODEL", help="a model file, or quill")
     words = "adopt the model that the service proposes ([loop]): only this one, by the first digits of its hash"
-    parser.add_argument("--candidate", type=_hash, nargs="?", const="", metavar="HASH", help=words)
+    parser.add_argument("--candidate", type=_hash, nargs="?", const=True, metavar="HASH", help=words)
     back(parser)
 
 
 def dismiss(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `dismiss`."""
     words = "the first digits of its hash (default: the proposed one)"
-    parser.add_argument("candidate", type=_hash, nargs="?", default="", metavar="HASH", help=words)
+    parser.add_argument("candidate", type=_hash, nargs="?", default=True, metavar="HASH", help=words)
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)

@@ -42,8 +42,8 @@ class Reads:
     kind: Callable[[str], Any] = Path
 
     def __call__(self, text: str) -> Any:
-        """Return the value."""
-        return self.kind(text)
+        """Return the value; an empty word, as of a variable that is not set, would be the present folder."""
+        return self.kind(_named(text))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,13 @@ class Writes:
 
     def __call__(self, text: str) -> Path:
         """Return the value."""
-        return Path(text)
+        return Path(_named(text))
+
+
+def _named(text: str) -> str:
+    if not text:
+        raise argparse.ArgumentTypeError("'': expected a name")
+    return text
 
 
 def check_outputs(arguments: argparse.Namespace) -> None:

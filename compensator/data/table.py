@@ -372,17 +372,19 @@ def roles_of(pairs: Sequence[str]) -> dict[str, str]:
     Raises
     ------
     UsageError
-        If one of them is no such pair.
+        If one of them is no such pair, or has the role of another one.
 
     Examples
     --------
     >>> roles_of(["t_q_degc=t5_degc"])
     {'t_q_degc': 't5_degc'}
     """
-    roles = {}
+    roles: dict[str, str] = {}
     for pair in pairs:
         role, equals, name = pair.partition("=")
         if not equals or not role or not name:
             raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
+        if role in roles:
+            raise UsageError(f"--column {pair}: {role} is {roles[role]} already, expected each role once")
         roles[role] = name
     return roles

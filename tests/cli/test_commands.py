@@ -16,11 +16,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.cli import load, main
+from compensator.cli import _parser, load, main
+from compensator.commands.adopt import _hash_of
 from compensator.commands.catalog import COMMANDS
 from compensator.config import Zenoh
+from compensator.data.table import roles_of
 from compensator.demo.day import START_NS, run_day
 from compensator.demo.machine import configuration, hardware
+from compensator.errors import UsageError
 from compensator.model.model_file import load_model
 from compensator.recording.reading import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -468,6 +471,20 @@ def test_wrong_usage_is_one_line_that_leads_to_the_help(words: list[str], capsys
         (["completion", "bsh"], "did you mean bash"),
         (["bridge"], "required: protocol (one of opcua, probes), --config;"),
         (["explain", "--cod"], "unrecognized arguments: --cod"),
+        (["hold", "--config", "a.toml", "--con=b.toml"], "argument --config: given twice, expected once;"),
+        (
+            ["simulate", "a.csv", "--out", "b", "--model", "quill", "--y-std", "1", "--y-std", "1"],
+            "--y-std: given twice",
+        ),
+        (
+            ["identify", "a.csv", "--out", "b", "--order", "1", "1", "1", "--order", "1", "1", "1"],
+            "--order: given twice",
+        ),
+        (["replay", ""], "argument FILE.mcap: '': expected a name;"),
+        (["simulate", "a.csv", "--out", "", "--model", "quill"], "argument --out: '': expected a name;"),
+        (["check", "--config="], "argument --config: '': expected a name;"),
+        (["adopt", "--config", "a.toml", "--candidate", ""], "argument --candidate: '': expected the first 6 or more"),
+        (["dismiss", "", "--config", "a.toml"], "argument HASH: '': expected the first 6 or more"),
     ],
 )
 def test_wrong_usage_names_what_can_be_chosen(
@@ -476,6 +493,20 @@ def test_wrong_usage_names_what_can_be_chosen(
     with pytest.raises(SystemExit):
         main(words)
     assert expected in capsys.readouterr().err
+
+
+def test_what_may_be_repeated_may_and_a_second_command_begins_anew() -> None:
+    words = ["compare", "a.csv", "--model", "quill", "--model", "b.toml", "--column", "t_s=t", "--column", "y_um=y"]
+    for _ in range(2):
+        given = _parser().parse_args(words)
+        assert given.model == ["quill", "b.toml"] and given.column == ["t_s=t", "y_um=y"]
+    parser = _parser()
+    for name in ("a.toml", "b.toml"):
+        assert parser.parse_args(["check", "--config", name]).config == name
+    for words, hash_ in ((["adopt", "--candidate"], ""), (["dismiss"], ""), (["dismiss", "055e0d2a"], "055e0d2a")):
+        assert _hash_of(parser.parse_args([*words, "--config", "a.toml"])) == hash_
+    with pytest.raises(UsageError, match="--column t_s=u: t_s is t already"):
+        roles_of(["t_s=t", "t_s=u"])
 
 
 def test_every_command_is_there_and_its_example_parses(capsys: pytest.CaptureFixture[str]) -> None:
