@@ -134,7 +134,7 @@ def ask(
     NotReached
         If nothing answers at the endpoints, or no service of that prefix is alive; the message names those that are.
     ServiceError
-        If the service is alive but does not answer, or what answers is no service.
+        If the service is alive but does not answer in time, or what answers is no service.
     """
     operator = operator or operator_here(settings)
     unreached = f"{settings.prefix}: the service cannot be reached"
@@ -156,8 +156,9 @@ def ask(
         ) from error
     if settings.prefix in alive:
         raise ServiceError(
-            f"{key}: the service is alive but does not answer; check that the router's access list permits "
-            f"{operator.name or 'this command'}"
+            f"{key}: the service is alive but has not answered within {timeout_s:g} s, so it is unknown whether the "
+            "command acts: look at `compensator watch`; if it never answers, check that the router's access list "
+            f"permits {operator.name or 'this command'}"
         )
     raise NotReached(f"{unreached}: no service with that prefix at {where}; {services_text(alive)}")
 

@@ -66,6 +66,25 @@ def test_an_answer_that_is_not_that_of_a_service_is_no_success(
             CommandSink(service, "probes.toml").send(Probe(time_utc_ns=1, measured_um=1.0, offset_applied_um=0.0))
 
 
+def test_a_service_that_answers_late_may_act_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port, asked, told = free_port(), threading.Event(), threading.Event()
+
+    def late(*_: Any) -> Any:
+        asked.set()
+        told.wait(60.0)
+        return {"ok": True, "text": "held"}
+
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", listen=[f"tcp/127.0.0.1:{port}"])
+    with Publisher(settings, late):
+        words = ["hold", "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port), "--timeout", "1"]
+        code, error = main(words), capsys.readouterr().err
+        told.set()
+    assert code == 1 and asked.is_set()
+    assert "has not answered within 1 s, so it is unknown whether the command acts: look at" in error
+
+
 def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> None:
     assert not is_used(tmp_path, "vmc-07") and list(tmp_path.iterdir()) == []
     with sole_user(tmp_path, "vmc-07"):
