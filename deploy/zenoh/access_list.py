@@ -205,8 +205,10 @@ def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
                     refuse(f"{kind} {table['name']!r}: machine {machine!r}: no such [[machine]]")
     prefixes = [machine["prefix"] for machine in shop["machine"]]
     for one in prefixes:
-        if sum(other == one or other.startswith(f"{one}/thermal/") for other in prefixes) > 1:
+        if sum(other == one or f"{other}/".startswith(f"{one}/thermal/") for other in prefixes) > 1:
             refuse(f"machine: prefix {one!r} is used twice, or another is below it")
+    if not shop["router"]["listen"]:
+        refuse("router: listen = [], expected at least one tls/HOST:PORT")
     for endpoint in shop["router"]["listen"]:
         if not endpoint.startswith(("tls/", "quic/")):
             refuse(f"router: listen {endpoint!r}, expected tls/HOST:PORT: only TLS proves who connects")

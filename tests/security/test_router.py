@@ -141,6 +141,15 @@ def test_a_list_may_begin_with_the_mark_of_an_editor(tmp_path: Path) -> None:
         ('name = "anna"', "name = 5", "name = 5, expected a text"),
         ('machines = ["vmc-07"]', "machines = [7]", "expected texts"),
         ('machines = ["vmc-07"]', "machines = []", "expected at least one"),
+        ('listen = ["tls/0.0.0.0:7447"]', "listen = []", "router: listen = [], expected at least one"),
+        *(
+            (
+                "[[operator]]",
+                f'[[machine]]\nname = "b"\nprefix = "shop/vmc-07{below}"\n[[operator]]',
+                "another is below it",
+            )
+            for below in ("/thermal", "/thermal/b", "")
+        ),
         ("[[operator]]", "[operator]", "expected tables [[operator]]"),
         ("[[operator]]", ".".join("a" * 400) + " = 1\n[[operator]]", "more than 300 points"),
     ],
@@ -153,6 +162,13 @@ def test_a_list_that_gives_other_rights_than_meant_is_refused(
     path = tmp_path / "shop.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")
     assert expected in script("access_list.py", str(path), code=1)
+
+
+def test_machines_may_be_below_one_another_where_their_messages_are_apart(tmp_path: Path) -> None:
+    more = '[[machine]]\nname = "b"\nprefix = "shop/vmc-07/thermal-b"\n[[machine]]\nname = "c"\nprefix = "shop"\n'
+    path = tmp_path / "shop.toml"
+    path.write_text((DEPLOY / "shop.toml").read_text(encoding="utf-8") + more, encoding="utf-8")
+    assert "shop/vmc-07/thermal-b/thermal/**" in script("access_list.py", str(path))
 
 
 def test_what_has_no_end_is_neither_a_list_nor_a_certificate(tmp_path: Path, shop: Shop) -> None:
