@@ -2,8 +2,9 @@
 """Make a small certificate authority and the certificates of router, machines, receivers, operators, probes and tools.
 
 The router's access list goes by the common name of each certificate. Keys are written with mode 0600. Running it again
-keeps what is there and valid, and makes only what is missing; `--renew` replaces certificates with less than
-`--renew-below` days left. Needs the package cryptography (`pip install quill-compensator[tls]`).
+keeps what is there and valid, and makes what is missing, has expired or is for other hosts of the router; `--renew`
+replaces certificates with less than `--renew-below` days left, too. Needs the package cryptography
+(`pip install quill-compensator[tls]`).
 
 example: certificates.py keys --router localhost --machine vmc-07 --receiver cnc-07 --operator anna
 """
@@ -31,6 +32,8 @@ except ImportError:
 ROLES = ("machine", "receiver", "operator", "probe", "tool")
 #: Largest file of a key or certificate, bytes.
 LONGEST = 100_000
+#: Longest time in days, of an expired certificate for tests, too.
+LONGEST_DAYS, EXPIRED_DAYS = 36_500, 3_650
 CLOCK_SKEW = datetime.timedelta(hours=1)
 
 
@@ -112,7 +115,11 @@ def authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCur
         missing = key_path if path.exists() else path
         sys.exit(f"{missing}: missing, but the other half of the authority exists; nothing is overwritten")
     if path.exists():
-        return read_certificate(path), read_key(key_path)
+        certificate = read_certificate(path)
+        if certificate.not_valid_after_utc <= now():
+            until = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
+            sys.exit(f"{path}: has expired on {until}; nothing is overwritten, expected another folder")
+        return certificate, read_key(key_path)
     key = new_key(key_path)
     # A log could not tell two authorities of one name apart.
     name = name_of(f"compensator CA {os.urandom(4).hex()}")
@@ -188,8 +195,10 @@ def issue(
     write(folder / f"{stem}.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
-def is_valid(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_below_days: float) -> bool:
-    """Return whether a certificate of this authority exists with its key and lasts long enough."""
+def is_valid(
+    folder: Path, stem: str, name: str, hosts: list[str], ca: x509.Certificate, renew_below_days: float
+) -> bool:
+    """Return whether a certificate of this authority exists with its key, is for these hosts and lasts long enough."""
     path, key_path = folder / f"{stem}.pem", folder / f"{stem}.key"
     if not path.exists() or not key_path.exists():
         return False
@@ -199,6 +208,9 @@ def is_valid(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_bel
     except (ValueError, TypeError, InvalidSignature):
         sys.exit(f"{path}: of another authority than {folder / 'ca.pem'}; nothing is overwritten")
     if common_name(certificate) != name or certificate.public_key() != read_key(key_path).public_key():
+        return False
+    named = [one.value for one in certificate.extensions if isinstance(one.value, x509.SubjectAlternativeName)]
+    if hosts and {name for one in named for name in one} != {alternative(host) for host in hosts}:
         return False
     return certificate.not_valid_after_utc - now() > datetime.timedelta(days=renew_below_days)
 
@@ -222,7 +234,7 @@ def main() -> int:
     if arguments.days < 0:  # an expired one, for tests
         begins = ends - datetime.timedelta(days=1)
     for stem, name, hosts in wanted:
-        if not is_valid(folder, stem, name, ca[0], arguments.renew_below if arguments.renew else -1e6):
+        if not is_valid(folder, stem, name, hosts, ca[0], arguments.renew_below if arguments.renew else 0.0):
             issue(folder, stem, name, hosts, ca, begins=begins, ends=ends)
             made.append(stem)
     for path in sorted(folder.glob("*.pem")):
@@ -247,6 +259,14 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--renew", action="store_true", help="replace those that end soon")
     parser.add_argument("--renew-below", type=float, default=60.0, metavar="DAYS", help="what soon means (60)")
     arguments = parser.parse_args()
+    # All of it before the first key is made: half an authority would stay.
+    for option, least in (("days", -EXPIRED_DAYS), ("ca_days", 1), ("renew_below", 0)):
+        value = getattr(arguments, option)
+        if not least <= value <= LONGEST_DAYS or (option == "days" and value == 0):
+            parser.error(f"--{option.replace('_', '-')} {value}: expected at most {LONGEST_DAYS} days")
+    for host in arguments.router:
+        if not re.fullmatch("[!-~]+", host):
+            parser.error(f"--router {host!r}: expected an address, or a name in ASCII such as router.shop")
     for role in ROLES:
         for name in getattr(arguments, role):
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}", name):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 import datetime
+import importlib.util
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
@@ -18,7 +21,7 @@ from compensator.cli import main
 from compensator.config import load_config
 from compensator.demo.machine import configuration
 from compensator.service.session import tls_files
-from tests.security.shop import script
+from tests.security.shop import DEPLOY, script
 
 LINES = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 10001, "command": 10023}
 TLS = """connect = ["tls/127.0.0.1:7447"]
@@ -163,3 +166,59 @@ def test_certificates_are_made_once_and_for_the_owner_alone(tmp_path: Path) -> N
     script("certificates.py", str(folder), "--operator", "anna", "--renew", "--renew-below", "9999")
     assert (folder / "operator-anna.pem").read_bytes() != before["operator-anna.pem"]
     assert (folder / "router.pem").read_bytes() == before["router.pem"]
+
+
+def test_a_certificate_that_cannot_work_is_made_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    hosts = ("--router", "192.168.10.2", "--router", "router.shop")
+    script("certificates.py", str(folder), *hosts, "--machine", "m1", "--days", "-5")
+    for _ in range(2):
+        again = script("certificates.py", str(folder), "--machine", "m1")
+    assert again.count("new") == 0 and is_good(folder / "machine-m1.pem") and not is_good(folder / "router.pem")
+    assert script("certificates.py", str(folder), *hosts).count("new") == 1
+    before = (folder / "router.pem").read_bytes()
+    assert script("certificates.py", str(folder), *hosts[2:], *hosts[:2]).count("new") == 0
+    moved = script("certificates.py", str(folder), "--router", "192.168.10.3", "--machine", "m1")
+    assert moved.count("new") == 1 and (folder / "router.pem").read_bytes() != before
+    names = x509.load_pem_x509_certificate((folder / "router.pem").read_bytes()).extensions
+    (name,) = names.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert str(name.value) == "192.168.10.3"
+
+
+def is_good(path: Path) -> bool:
+    now = datetime.datetime.now(datetime.UTC)
+    return x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc > now
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--days", "99999999"),
+        ("--days", "0"),
+        ("--days", "-36500"),
+        ("--ca-days", "-2"),
+        ("--ca-days", "0"),
+        ("--renew-below", "nan"),
+        ("--router", "r\u00f6uter"),
+        ("--router", ""),
+    ],
+)
+def test_what_no_certificate_can_have_is_refused_before_a_key_is_made(tmp_path: Path, words: tuple[str, str]) -> None:
+    folder = tmp_path / "keys"
+    error = script("certificates.py", str(folder), "--machine", "m1", *words, code=2)
+    assert words[0] in error and "Traceback" not in error and not folder.exists()
+
+
+def test_an_authority_that_has_expired_signs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "keys"
+    script("certificates.py", str(folder), "--machine", "m1", "--ca-days", "1")
+    spec = importlib.util.spec_from_file_location("certificates", DEPLOY / "certificates.py")
+    assert spec is not None and spec.loader is not None
+    certificates = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(certificates)
+    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=2)
+    monkeypatch.setattr(certificates, "now", lambda: later)
+    monkeypatch.setattr(sys, "argv", ["certificates.py", str(folder), "--machine", "m2"])
+    with pytest.raises(SystemExit, match="has expired on"):
+        certificates.main()
+    assert not (folder / "machine-m2.pem").exists()
