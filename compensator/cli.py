@@ -25,7 +25,7 @@ from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer
 from compensator.commands.catalog import COMMANDS, USERS, Command
-from compensator.commands.outputs import check_outputs
+from compensator.commands.outputs import check_outputs, takes_stdout
 from compensator.commands.stopping import stoppable, was_interrupted
 from compensator.commands.wrapping import styled, wrapped
 from compensator.errors import CompensatorError, in_words, one_line
@@ -59,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     log.setLevel(logging.INFO)  # what libraries tell is of no use to an operator, what they warn of is
     try:
         check_outputs(given)
+        is_taken = takes_stdout(given)
         answer = load(given.command)(given)
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:
@@ -78,6 +79,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if answer is None:
         return 0
     text = json.dumps(answer.result) if given.json else answer.text
+    if is_taken:
+        log.info("%s", text)
+        return answer.code
     return _printed(text, answer.code, for_people=not given.json)
 
 

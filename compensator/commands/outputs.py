@@ -108,6 +108,16 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         kind.check(path, option)
 
 
+def takes_stdout(arguments: argparse.Namespace) -> bool:
+    """Return whether something that a command writes goes to standard output, where nothing else belongs then."""
+    for action in arguments.parser._actions:
+        path = getattr(arguments, action.dest, None) if isinstance(action.type, Writes) else None
+        with suppress(OSError, ValueError):
+            if path is not None and os.path.samestat(found := path.stat(), os.fstat(1)):
+                return not os.path.samestat(found, Path(os.devnull).stat())
+    return False
+
+
 def pages_text(page: Path, also: Path | None) -> str:
     """Return a line for each page that was written."""
     return "\n".join(f"page: {path}" for path in (page, also) if path is not None)

@@ -39,6 +39,19 @@ def test_a_closed_stream_changes_no_exit_code(rec: Path, closed: str) -> None:
     assert done.returncode == 2 and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("to", ["| cat", "> {out}"])
+def test_a_table_that_goes_to_standard_output_has_nothing_else_in_it(rec: Path, to: str, tmp_path: Path) -> None:
+    table, out = tmp_path / "table.csv", tmp_path / "out.csv"
+    plain = ended(f"compensator export {rec} --out {table}")
+    assert plain.stdout.startswith("5 samples") and plain.stderr == ""
+    for option in ("", " --json"):
+        done = ended(f"compensator export {rec} --out /dev/stdout{option} {to.format(out=out)}")
+        assert (out.read_text() if out.exists() else done.stdout) == table.read_text()
+        assert done.stderr.count("\n") == 1 and "5" in done.stderr
+    done = ended(f"compensator export {rec} --out /dev/null > /dev/null")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
 @pytest.mark.parametrize("option", ["", "--json"])
 def test_a_result_that_cannot_be_written_is_a_failure_in_one_line(rec: Path, option: str) -> None:
