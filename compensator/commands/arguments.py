@@ -273,7 +273,9 @@ def adopt(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", type=_READ_TEXT, nargs="?", metavar="MODEL", help="a model file, or quill")
     words = "adopt the model that the service proposes ([loop]): only this one, by the first digits of its hash"
     parser.add_argument("--candidate", type=_hash, nargs="?", const=True, metavar="HASH", help=words)
-    back(parser)
+    words = "adopt the model even if measured Y shows that it is clearly worse, or the recordings do not determine its "
+    words += "state; its standard deviation is then larger"
+    _change(parser, words)
 
 
 def dismiss(parser: argparse.ArgumentParser) -> None:
@@ -287,15 +289,16 @@ def dismiss(parser: argparse.ArgumentParser) -> None:
 
 
 def back(parser: argparse.ArgumentParser) -> None:
-    """Describe the arguments of `back`; `adopt` has them as well."""
+    """Describe the arguments of `back`."""
+    words = "go back even if the recordings do not determine the model's state; its standard deviation is then larger"
+    _change(parser, words)
+
+
+def _change(parser: argparse.ArgumentParser, force: str) -> None:
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=_READ, metavar="FILE", help=_OPERATOR)
-    words = (
-        "adopt the model even if measured Y shows that it is clearly worse, or the recordings do not determine its "
-        "state; its standard deviation is then larger"
-    )
-    add("--force", action="store_true", help=words)
+    add("--force", action="store_true", help=force)
     _timeout(parser, 60.0)
 
 

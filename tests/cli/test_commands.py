@@ -429,6 +429,15 @@ def test_every_command_has_help_with_an_example(capsys: pytest.CaptureFixture[st
         assert f"example: compensator {command}" in capsys.readouterr().out
 
 
+def test_only_adopt_says_that_it_refuses_a_worse_model(capsys: pytest.CaptureFixture[str]) -> None:
+    """`back` is never refused for its figures."""
+    for command, says in (("adopt", True), ("back", False)):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        text = " ".join(capsys.readouterr().out.split())
+        assert ("clearly worse" in text) == says and "do not determine" in text
+
+
 def test_explain_knows_every_state_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
     for code in ("starting", "ok", "degraded", "hold", "fault", "outside_validity:t_q_degc", "outlier", "HOLD"):
         assert main(["explain", code]) == 0
