@@ -106,7 +106,10 @@ class Installation:
 
     def build(self, wheel: Path, wheels: Path | None, extras: Sequence[str], *, dependencies: bool) -> Path:
         """Make the virtual environment of a wheel; a complete one stays, an incomplete one is made again."""
-        digest = hashlib.sha256(read(wheel, WHEEL_BYTES) + " ".join(extras).encode()).hexdigest()
+        # What else is installed with it: the same program beside newer dependencies is another environment.
+        beside = [*extras, *([] if dependencies else ["--no-deps"])]
+        beside += sorted(path.name for path in wheels.glob("*.whl")) if wheels else []
+        digest = hashlib.sha256(read(wheel, WHEEL_BYTES) + " ".join(beside).encode()).hexdigest()
         version = self.root / "versions" / f"{wheel.name.split('-')[1]}-{digest[:8]}"
         if (version / ".complete").exists():
             report(f"{version.name}: installed already")

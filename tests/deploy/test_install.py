@@ -179,7 +179,14 @@ def test_an_upgrade_brings_the_extras_along(pc: Pc, monkeypatch: pytest.MonkeyPa
     pc.installation.point("current", version)
     assert pc.installation.extras() == ["sign", "tls"]
     assert pc.installation.build(wheel, None, ["sign", "tls"], dependencies=True) == version and len(asked) == 1
-    assert pc.installation.build(wheel, None, [], dependencies=True) != version  # another set is another environment
+    # Another set is another environment.
+    (wheels := tmp_path / "wheels").mkdir()
+    made = [version, pc.installation.build(wheel, None, [], dependencies=True)]
+    made.append(pc.installation.build(wheel, None, [], dependencies=False))
+    for name in ("numpy-1.0-py3-none-any.whl", "numpy-1.1-py3-none-any.whl"):
+        (wheels / name).touch()
+        made += [pc.installation.build(wheel, wheels, [], dependencies=True) for _ in range(2)]
+    assert len({*made}) == 5 and len(asked) == 5
 
 
 def test_half_a_version_is_made_anew(pc: Pc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
