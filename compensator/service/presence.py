@@ -27,6 +27,8 @@ from compensator.service.session import ALIVE, client_config, tokens
 
 log = logging.getLogger("compensator")
 
+#: How long a start retries a lock that may be that of a command, s.
+LOOKED_AT_S = 0.5
 #: How long a start retries a router that refuses the connection, s.
 REACHED_S = 1.0
 #: How long the token of a killed service may remain (the lease and a margin), s.
@@ -59,7 +61,7 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
         try:
             descriptor = _opened(path)
             held.callback(os.close, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(descriptor)
         except BlockingIOError as error:
             raise ServiceError(
                 f"{path}: locked by another service of {machine}, which continues; this one ends"
@@ -68,6 +70,18 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
             figures = f"{path}: cannot be locked, so a second service would not be detected here: {error}."
             log.warning("%s", Remark(ServiceWarning.NOT_LOCKED, figures).marked)
         yield
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file; a command that looks whether it is locked (`is_used`) holds it for an instant."""
+    end = time.monotonic() + LOOKED_AT_S
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(LOOKED_AT_S / 50.0)
 
 
 def is_used(folder: Path, machine: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import threading
@@ -15,6 +16,7 @@ from compensator.commands.probes import CommandSink
 from compensator.config import Zenoh
 from compensator.probes.probe import NotSent, Probe
 from compensator.probes.settings import Service
+from compensator.service import presence
 from compensator.service.presence import is_used, sole_user
 from compensator.service.publisher import Publisher
 from tests.receiver.wire import free_port
@@ -92,6 +94,18 @@ def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> No
     assert not is_used(tmp_path, "vmc-07")
     with sole_user(tmp_path, "vmc-07"):  # looking did not keep it
         pass
+
+
+def test_a_start_is_not_refused_because_a_command_looks_at_its_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with sole_user(tmp_path, "vmc-07"):
+        pass
+    with (tmp_path / "vmc-07.lock").open() as looks:
+        fcntl.flock(looks, fcntl.LOCK_SH)  # as `is_used` does
+        monkeypatch.setattr(presence.time, "sleep", lambda _: fcntl.flock(looks, fcntl.LOCK_UN))
+        with sole_user(tmp_path, "vmc-07"):
+            assert is_used(tmp_path, "vmc-07")
 
 
 def test_a_pipe_in_the_place_of_the_lock_is_asked_without_waiting_for_its_writer(tmp_path: Path) -> None:
