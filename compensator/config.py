@@ -32,7 +32,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _VALUE_MAX = 1e12
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
 #: Transports on which participants authenticate by certificates.
-_SECURED = ("tls/", "quic/")
+SECURED = ("tls/", "quic/")
 _TLS_KEYS = ("tls_ca", "tls_certificate", "tls_key")
 
 
@@ -355,6 +355,21 @@ class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
         return self.resolve(name) if name.endswith(".toml") or "/" in name else name
 
 
+def zenoh_below(prefix: str) -> Zenoh:
+    """Return the settings for the prefix that an option `--prefix` names.
+
+    Raises
+    ------
+    UsageError
+        If no machine can have it.
+    """
+    try:
+        return msgspec.convert({"prefix": prefix}, Zenoh)
+    except msgspec.ValidationError as error:
+        words = "expected names between single slashes, such as shop/vmc-07, of 200 characters at most"
+        raise UsageError(f"--prefix {prefix[:210]!r}: {words}") from error
+
+
 def load_config(path: str | Path) -> LoadedConfig:
     """Read and check a configuration; nothing is opened.
 
@@ -514,10 +529,10 @@ def _check(config: Config) -> None:
 def _check_zenoh(zenoh: Zenoh) -> None:
     given = [key for key in _TLS_KEYS if getattr(zenoh, key) is not None]
     for endpoint in zenoh.listen + zenoh.connect:
-        if bool(given) != endpoint.startswith(_SECURED) and endpoint in zenoh.connect:
+        if bool(given) != endpoint.startswith(SECURED) and endpoint in zenoh.connect:
             expected = "tls/HOST:PORT with tls_ca, tls_certificate and tls_key" if given else "with tls_ca, …"
             raise ConfigError(f"zenoh.connect: {endpoint!r}, expected {expected}")
-        if endpoint.startswith(_SECURED) and endpoint in zenoh.listen:
+        if endpoint.startswith(SECURED) and endpoint in zenoh.listen:
             raise ConfigError(
                 f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has an "
                 f"access list, the service has none"

@@ -6,10 +6,8 @@ import argparse
 import json
 from typing import Any
 
-import msgspec
-
 from compensator.commands import Answer
-from compensator.config import Zenoh, load_config
+from compensator.config import load_config, zenoh_below
 from compensator.errors import ServiceError, UsageError
 from compensator.events import CommandName
 from compensator.service.command_client import Operator, ask, operator_of_file
@@ -46,12 +44,7 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
     elif operator is None:
         raise UsageError("--zenoh: required with --prefix, expected a Zenoh configuration such as operator.json5")
     else:
-        try:
-            settings = msgspec.convert({"prefix": arguments.prefix}, Zenoh)
-        except msgspec.ValidationError as error:
-            raise UsageError(
-                f"--prefix {arguments.prefix!r}: expected names between single slashes, such as shop/vmc-07"
-            ) from error
+        settings = zenoh_below(arguments.prefix)
     return answered(ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator))
 
 

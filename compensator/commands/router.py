@@ -15,12 +15,11 @@ from compensator.certificates import check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer, log_warnings
 from compensator.commands.stopping import on_stop
+from compensator.config import SECURED
 from compensator.errors import ConfigError, ServiceError
 from compensator.service.session import ConfigFile, bound_silent, error_text, files_of, get, read_config_file, set_key
 
 log = logging.getLogger("compensator")
-
-_SECURED = ("tls/", "quic/")
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
@@ -61,7 +60,7 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
         if get(config, f"scouting/{name}/enabled") is None:
             set_key(config, f"scouting/{name}/enabled", False)
     _check_access(path, config, endpoints)
-    if any(endpoint.startswith(_SECURED) for endpoint in endpoints):
+    if any(endpoint.startswith(SECURED) for endpoint in endpoints):
         now = datetime.datetime.now(datetime.UTC)
         certificate = check_files(str(path), files_of(path, file.tls, "listen"))
         wrong = certificate.wrong_at(now) if certificate is not None else None
@@ -91,7 +90,7 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     if get(config, "transport/link/tls/enable_mtls") is not True:
         raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true; the access list uses certificates")
     for endpoint in endpoints:
-        if not endpoint.startswith(_SECURED):
+        if not endpoint.startswith(SECURED):
             raise ConfigError(
                 f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list uses certificates"
             )

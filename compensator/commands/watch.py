@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import logging
-import re
 import secrets
 import stat
 import sys
@@ -21,7 +20,7 @@ from compensator.atomic_write import replace_file
 from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.commands.stopping import Stop, until_stopped
-from compensator.config import LoadedConfig, load_config
+from compensator.config import LoadedConfig, load_config, zenoh_below
 from compensator.errors import ServiceError, UsageError
 from compensator.input_file import KEY_BYTES, read_file
 from compensator.service.session import services_text
@@ -119,8 +118,8 @@ def _token(path: Path | None) -> str:
 def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Source:
     """Return the endpoints and the prefix."""
     prefix = arguments.prefix
-    if prefix is not None and not re.fullmatch(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*", prefix):
-        raise UsageError(f"--prefix {prefix!r}: expected names between single slashes, such as shop/vmc-07")
+    if prefix is not None:
+        zenoh_below(prefix)
     if arguments.connect and arguments.zenoh:
         raise UsageError("--connect: cannot be combined with --zenoh, whose file contains the endpoints")
     if prefix is None:

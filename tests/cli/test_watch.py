@@ -179,6 +179,7 @@ def test_a_recording_of_the_shop_ends_whole(running: tuple[Path, int], tmp_path:
         (["--connect", "tcp/127.0.0.1:1", "--once"], "no answer at tcp/127.0.0.1:1"),
         (["--connect", "127.0.0.1:1", "--once"], "expected an endpoint"),
         (["--connect", "tcp/127.0.0.1:1", "--prefix", "shop/**"], "expected names"),
+        (["--connect", "tcp/127.0.0.1:1", "--prefix", "a" * 201, "--once"], "of 200 characters at most"),
         (["--connect", "tcp/127.0.0.1:1", "--page", "--port", "99999999"], "--port 99999999"),
     ],
 )
