@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -122,6 +123,16 @@ def test_a_good_file_is_said_to_be_good(shop: Shop, capsys: pytest.CaptureFixtur
 def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
     shipped = (DEPLOY / "router.json5").read_text(encoding="utf-8")
     assert shipped == script("access_list.py", str(DEPLOY / "shop.toml"))
+
+
+def test_the_shipped_list_shows_every_role(tmp_path: Path) -> None:
+    """One that no machine needs from the start is commented out."""
+    text = (DEPLOY / "shop.toml").read_text(encoding="utf-8")
+    text = re.sub(r"^# (?=\[\[|\w+ = )", "", text, flags=re.MULTILINE)
+    (tmp_path / "shop.toml").write_text(text, encoding="utf-8")
+    made = script("access_list.py", str(tmp_path / "shop.toml"))
+    for name in ("vmc-07 publishes", "cnc-07 reads", "anna commands", "probe-07 probes", "tool-07 publishes"):
+        assert f'"{name}"' in made
 
 
 def test_a_list_may_begin_with_the_mark_of_an_editor(tmp_path: Path) -> None:
