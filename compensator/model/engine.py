@@ -2,7 +2,7 @@
 
 The service, `simulate`, `identify` and `replay` all run this class, `diagnose` for the effects that a model already
 has. `run` is `step` over a whole record, so both give the same bits. A step takes constant time, except the one that
-ends a gap: it returns to the last complete sample and repeats the missing ones with interpolated inputs, at most
+ends a gap: it returns to the sample before the gap and repeats the missing ones with interpolated inputs, at most
 `bridge_samples` of them.
 """
 
@@ -107,9 +107,14 @@ class Inputs:
     channels: dict[str, float]
 
     @property
+    def has_temperatures(self) -> bool:
+        """Whether neither T_Q nor AT is missing."""
+        return not (math.isnan(self.t_q_k) or math.isnan(self.at_k))
+
+    @property
     def complete(self) -> bool:
         """Whether nothing is missing."""
-        return not (math.isnan(self.t_q_k) or math.isnan(self.at_k) or any(map(math.isnan, self.channels.values())))
+        return self.has_temperatures and not any(map(math.isnan, self.channels.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +132,8 @@ class EngineState:
     reference : Reference
         What the inputs are changes from.
     last_complete : Inputs, optional
-        The last complete sample, where a gap that begins after it may be bridged.
+        The last sample with both temperatures, where a gap that begins after it may be bridged; complete, unless a
+        channel has been missing for longer than a gap may last.
     gap : Gap, optional
         The gap under way.
     shifted_k : tuple of (float, float)
@@ -145,14 +151,14 @@ class EngineState:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Incomplete samples since the last complete one, kept to be repeated.
+    """Samples without T_Q, AT or a channel since one that had them, kept to be repeated.
 
     Parameters
     ----------
     state : EngineState
         State before the first of them.
     before : Inputs or None
-        The complete sample before them; None where there is none.
+        The sample before them, with the last good value of each channel; None where there is none.
     samples : tuple of Inputs
         The incomplete samples.
     limit : int
@@ -167,6 +173,11 @@ class Gap:
     samples: tuple[Inputs, ...] = ()
     limit: int = BRIDGE_SAMPLES
     held: bool = False
+
+    @property
+    def is_of_channels(self) -> bool:
+        """Whether it has samples, and channels alone are missing in them."""
+        return bool(self.samples) and all(sample.has_temperatures for sample in self.samples)
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,10 +385,13 @@ class Engine:
             channels={name: given.get(name, NAN) for name in self.channels},
         )
         unknown = None
-        if inputs.complete:
-            if self._gap is not None:
+        gap = self._gap
+        # A dead channel must not keep the temperatures from being repeated.
+        is_over = gap is not None and inputs.has_temperatures and not gap.is_of_channels
+        if inputs.complete or is_over:
+            if gap is not None:
                 unknown = self._observer.covariance_ahead()
-                self._repeat(self._gap, inputs)
+                self._repeat(gap, inputs)
                 self._gap = None
             self._last_complete = inputs
         else:
@@ -510,7 +524,7 @@ class Engine:
         ]
 
     def skip(self, samples: int, *, held: bool = False) -> Estimate:
-        """Skip samples that were not measured, as missing ones; the next complete sample repeats them.
+        """Skip samples that were not measured, as missing ones; the next sample with both temperatures repeats them.
 
         Parameters
         ----------
@@ -530,7 +544,8 @@ class Engine:
         ModelError
             If there is no reference yet.
         """
-        gap = self._gap or Gap(state=self.snapshot(), before=self._last_complete)
+        self._end_gap_of_channels()
+        gap = self._gap or self._new_gap()
         if held or gap.before is not None:
             # A long pause must not use up the limit of a short sensor loss after it.
             limit = max(gap.limit, len(gap.samples) + samples + self.bridge_samples)
@@ -636,15 +651,33 @@ class Engine:
 
     def _remember(self, inputs: Inputs) -> None:
         """Keep an incomplete sample, as long as the gap can still be bridged."""
+        if not inputs.has_temperatures:
+            self._end_gap_of_channels()
+        elif self._gap is None and not (self._last_complete and self._last_complete.complete):
+            # A channel has been missing for too long to be interpolated: a gap begins once a temperature is, too.
+            self._last_complete = inputs
+            return
         if self._gap is None and self._last_complete is not None:
-            self._gap = Gap(state=self.snapshot(), before=self._last_complete, limit=self.bridge_samples)
+            self._gap = self._new_gap()
         if self._gap is not None:
             self._gap = dataclasses.replace(self._gap, samples=(*self._gap.samples, inputs))
             if len(self._gap.samples) > self._gap.limit:
-                self._gap = self._last_complete = None
+                self._gap, self._last_complete = None, inputs if inputs.has_temperatures else None
+
+    def _new_gap(self) -> Gap:
+        """Return a gap that begins after the last sample."""
+        before = self._last_complete
+        if before is not None:
+            before = dataclasses.replace(before, channels={name: self._held.get(name, NAN) for name in self.channels})
+        return Gap(state=self.snapshot(), before=before, limit=self.bridge_samples)
+
+    def _end_gap_of_channels(self) -> None:
+        """Leave channels as they were held: where a temperature is missing, too, the last one that was seen counts."""
+        if self._gap is not None and self._gap.is_of_channels:
+            self._last_complete, self._gap = self._gap.samples[-1], None
 
     def _repeat(self, gap: Gap, after: Inputs) -> None:
-        """Return to the last complete sample and repeat the gap with interpolated inputs."""
+        """Return to where the gap began and repeat it with interpolated inputs; what is missing at an end stays so."""
         reference, shifted_k = self._reference, self._shifted_k
         self.restore(gap.state)
         self._reference, self._shifted_k = reference, shifted_k

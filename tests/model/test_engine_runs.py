@@ -249,6 +249,65 @@ def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
     assert y_of(whole.run(t_q, at, {"coolant_degc": coolant}))[50:] == pytest.approx(y_of(run)[50:], abs=1e-12)
 
 
+COOLED = effect_from(
+    "input", {"channel": "coolant_degc", "curve": "linear", "tau_min": [10.0], "gain": [0.5], "delay_min": 0.0}
+)
+
+
+@pytest.mark.parametrize("method", ["inverse", "kalman"])
+@pytest.mark.parametrize(("dead_from", "lost"), [(298, 20), (250, 50), (100, 20), (310, 20), (100, 200), (290, 200)])
+def test_a_dead_channel_does_not_keep_a_gap_of_a_temperature_from_being_repeated(
+    method: str, dead_from: int, lost: int
+) -> None:
+    """The channel shows the same all the time: held, it says what it would have said."""
+    model = dataclasses.replace(with_method(method), effects=(COOLED,))
+    t_q, at = temperatures()
+
+    def run(dead_from: int) -> np.ndarray:
+        engine, found = started(model, t_q, at), []
+        for i in range(N):
+            channels = {"coolant_degc": 25.0 if i < dead_from else np.nan}
+            if lost <= 60 or not 300 <= i < 300 + lost:
+                found.append(engine.step(np.nan if 300 <= i < 300 + lost else t_q[i], at[i], channels))
+            elif i == 300:
+                engine.skip(lost)
+            if i % 50 == 7:
+                engine, before = Engine(model), engine
+                engine.check(before.snapshot())
+                engine.restore(before.snapshot())
+        return np.array([(one.y_um, one.y_std_um) for one in found])
+
+    assert run(dead_from).tolist() == run(N).tolist()
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_machine_that_begins_with_a_dead_channel_is_found_as_warm_as_it_is(held: bool) -> None:
+    assert QUILL.ttf is not None
+    t_q = 20.0 + QUILL.ttf.sampled.response(np.full(2000, 60.0))
+
+    def found(coolant: float) -> Estimate:
+        engine = started(dataclasses.replace(with_method("inverse"), effects=(COOLED,)), t_q, np.full(2000, 20.0))
+        if not held:
+            engine.step(20.0, 20.0, {"coolant_degc": coolant})
+        engine.skip(1500, held=held)
+        return engine.step(t_q[-1], 20.0, {"coolant_degc": coolant})
+
+    assert found(np.nan) == found(25.0)
+    assert found(np.nan).y_um > 40.0
+
+
+def test_a_channel_that_was_dead_for_long_is_taken_as_it_is_once_it_is_back() -> None:
+    model = dataclasses.replace(with_method("kalman"), effects=(COOLED,))
+    t_q, at = temperatures(0.02)
+    coolant = np.where(np.arange(N) < 400, 25.0, 40.0)
+    coolant[300:461] = np.nan
+    bridged, plain = (Engine(model, bridge_samples=samples) for samples in (60, 0))
+    for engine in (bridged, plain):
+        engine.set_reference(float(t_q[0]), float(at[0]))
+    channels = {"coolant_degc": coolant}
+    assert bridged.run(t_q, at, channels) == plain.run(t_q, at, channels)
+
+
 @pytest.mark.parametrize("method", ["inverse", "kalman"])
 def test_a_sensor_with_another_zero_does_not_move_what_acts_by_its_temperature(method: str) -> None:
     """A couple that was exchanged reads 3 K more: what coolant takes from the machine is as it was, over restarts."""
