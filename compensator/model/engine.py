@@ -546,7 +546,7 @@ class Engine:
         """
         self._end_gap_of_channels()
         gap = self._gap or self._new_gap()
-        if held or gap.before is not None:
+        if held or gap.held or gap.before is not None:
             # A long pause must not use up the limit of a short sensor loss after it.
             limit = max(gap.limit, len(gap.samples) + samples + self.bridge_samples)
             self._gap = dataclasses.replace(gap, limit=limit, held=held or gap.held)

@@ -296,6 +296,20 @@ def test_a_machine_that_begins_with_a_dead_channel_is_found_as_warm_as_it_is(hel
     assert found(np.nan).y_um > 40.0
 
 
+@pytest.mark.parametrize("second", [0, 40, 100])
+def test_a_second_pause_leaves_the_first_to_be_repeated(second: int) -> None:
+    """T_Q is not back yet after the first one, from which nothing is known of before."""
+    assert QUILL.ttf is not None
+    t_q = 20.0 + QUILL.ttf.sampled.response(np.full(2000, 60.0))
+    engine = Engine(with_method("inverse"))
+    engine.set_reference(20.0, 20.0)
+    engine.skip(1500, held=True)
+    engine.step(np.nan, 20.0)
+    if second:
+        engine.skip(second)
+    assert engine.step(t_q[-1], 20.0).y_um == pytest.approx(61.1, abs=0.5)
+
+
 def test_a_channel_that_was_dead_for_long_is_taken_as_it_is_once_it_is_back() -> None:
     model = dataclasses.replace(with_method("kalman"), effects=(COOLED,))
     t_q, at = temperatures(0.02)
