@@ -17,6 +17,7 @@ from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
 from tests.diagnose.scenarios import record
 from tests.identify.quill_runs import runs_from
+from tests.service.records import EFFECTS
 
 QUILL = load_model("quill")
 INVERSE = dataclasses.replace(QUILL, estimator=dataclasses.replace(QUILL.estimator, method="inverse"))
@@ -126,6 +127,15 @@ def test_a_restart_in_between_changes_no_bit(day, evidence):
 def test_a_wrong_table_names_kind_key_and_value(kind, table, words):
     with pytest.raises(ModelError, match=f"effect {kind}: .*{words}"):
         effect_from(kind, table)
+
+
+@pytest.mark.parametrize("name", ["t_q_degc", "at_degc", "y_um", ""])
+def test_no_effect_takes_a_temperature_of_the_paths_or_measured_y_as_its_channel(name):
+    """The service gives effects neither: they would act in `simulate` alone."""
+    for kind, table in EFFECTS:
+        for key in {"channel", "fluid"} & table.keys():
+            with pytest.raises(ModelError, match=f"effect {kind}: {key} = '{name}', expected a logged channel"):
+                effect_from(kind, table | {key: name})
 
 
 @pytest.mark.parametrize(("origin", "acts"), [(8.0, True), ("zero", True), ("start", False)])

@@ -23,12 +23,14 @@ from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.lateness import Lateness
 from compensator.model.effects.seen import Seen
 from compensator.model.effects.signals import RecordSignals, Signals
-from compensator.model.table import TomlTable
+from compensator.model.table import TomlTable, shown
 
 #: Largest number of coefficients or time constants of an effect.
 MODES = 64
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
+#: What is no channel: T_Q and AT act by the paths, and measured deformation is never fed back.
+REFUSED = ("t_q_degc", "at_degc", "y_um", "")
 #: Keys that a diagnosis gives every effect in the model file.
 _FOUND = ("std", "std_factor", "explanation")
 
@@ -55,6 +57,18 @@ def numbers(low: float = -math.inf, high: float = math.inf) -> Any:
 def text(*choices: str) -> Any:
     """Return a parameter that the model file holds: a string, one of the choices where there are any."""
     return dataclasses.field(metadata=_text(choices))
+
+
+def channel_name() -> Any:
+    """Return a parameter that the model file holds: the name of a logged channel, which is not T_Q, AT or Y."""
+
+    def read(table: TomlTable, key: str) -> str:
+        name = table.text(key)
+        if name in REFUSED:
+            raise ModelError(f"{table.where}: {key} = {shown(name)}, expected a logged channel, not T_Q, AT or Y")
+        return name
+
+    return dataclasses.field(metadata={"read": read})
 
 
 def text_or_number(*choices: str) -> Any:
@@ -100,7 +114,7 @@ class Effect:
     ----------
     path, channel : str
         Where it acts, if the kind needs it. Further parameters are fields of the subclass, those of the model file made
-        by `number`, `numbers` and `text`.
+        by `number`, `numbers`, `text` and the like.
     std : mapping of str to float
         Standard error of each parameter, where a diagnosis found it.
     std_factor : tuple of tuple of float
@@ -327,7 +341,18 @@ _loaded = False
 @dataclass_transform(
     frozen_default=True,
     kw_only_default=True,
-    field_specifiers=(number, optional_number, numbers, rows, optional_rows, text, text_or_number, texts, only),
+    field_specifiers=(
+        number,
+        optional_number,
+        numbers,
+        rows,
+        optional_rows,
+        text,
+        channel_name,
+        text_or_number,
+        texts,
+        only,
+    ),
 )
 def register(form: type[_E]) -> type[_E]:
     """Make a form of a kind of effect a frozen dataclass, and register it (class decorator)."""

@@ -18,12 +18,12 @@ from compensator.model.effects.base import (
     BankEffect,
     Effect,
     Run,
+    channel_name,
     number,
     numbers,
     only,
     optional_number,
     register,
-    text,
 )
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, S, exchanges
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, numbered, proposes
@@ -39,8 +39,8 @@ class Flow(BankEffect, Effect):
     kind = "input"
     linear = ("gain", "gain_air")
     form: str = only(default="flow")
-    channel: str = text()
-    fluid: str = text()
+    channel: str = channel_name()
+    fluid: str = channel_name()
     span: float = number(1e-12)
     half: float = number(1e-6, 1e6)
     surface_min: float = optional_number(0.0, 1e5, default=0.0)

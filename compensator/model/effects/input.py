@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
+from compensator.model.effects.base import BankEffect, Effect, Run, channel_name, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits, quantity, signed, unit_in
@@ -41,7 +41,7 @@ class Input(BankEffect, Effect):
 
     kind = "input"
     linear = ("gain",)
-    channel: str = text()
+    channel: str = channel_name()
     curve: str = text(*CURVES)
     tau_min: tuple[float, ...] = numbers(0.0, 1e5)
     gain: tuple[float, ...] = numbers()

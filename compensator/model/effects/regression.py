@@ -17,6 +17,7 @@ from typing import Any
 from compensator.arrays import LARGEST, NAN
 from compensator.errors import ModelError
 from compensator.model.effects.base import (
+    REFUSED,
     BankEffect,
     Effect,
     Run,
@@ -35,8 +36,6 @@ from compensator.model.table import shown
 #: Names of the base's own inputs: its drive by the kind of model, W or K, and the change of the ambient, K.
 DRIVE: Mapping[str, str] = {"heat": "heat_w", "direct": "t_q_degc - at_degc"}
 AMBIENT = "at_degc"
-#: What is no channel of it: T_Q acts by the drive, and measured deformation is never fed back.
-REFUSED = ("t_q_degc", "y_um", "")
 #: Most channels, lags for each, and rows of the factor: the time of a step grows with their product.
 MOST_CHANNELS, MOST_LAGS, MOST_ROWS = 64, 12, 8
 #: Channels named in the explanation.
@@ -104,7 +103,7 @@ class Regression(BankEffect, Effect):
         _check_each(
             "channels",
             self.channels,
-            lambda name: name not in REFUSED,
+            lambda name: name == AMBIENT or name not in REFUSED,
             f"a logged channel or an input of the base: {names}",
         )
         _check_each("exponents", self.exponents, lambda exponent: exponent in (1, 2), "1 or 2")

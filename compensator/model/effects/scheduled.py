@@ -26,6 +26,7 @@ from compensator.model.effects.base import (
     BankEffect,
     Effect,
     Run,
+    channel_name,
     number,
     numbers,
     only,
@@ -50,7 +51,7 @@ class Scheduled(Effect):
     #: What of the path changes, in words.
     what: ClassVar[str] = "gain"
     path: str = text("DTF", "TDTF")
-    channel: str = text()
+    channel: str = channel_name()
     origin: str | float = text_or_number("start", "zero")
     span: float = number(1e-12)
 
