@@ -21,7 +21,7 @@ from typing import Any
 from compensator.axes import FIRST, NAME, label_of
 from compensator.errors import CompensatorError, ModelError
 from compensator.input_file import MODEL_BYTES, parse_toml, read_file
-from compensator.model.effects import Effect, effect_from, kinds
+from compensator.model.effects import Effect, EffectStream, effect_from, kinds
 from compensator.model.table import TomlTable, shown
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
@@ -331,6 +331,11 @@ def _effects(model_name: str, value: object, period_s: float) -> tuple[Effect, .
     delays = sum(getattr(effect, "delay_min", 0.0) for effect in result) * 60.0 / period_s
     if delays > DELAY_SAMPLES:
         raise ModelError(f"effect: delays of {delays:.0f} samples in all, expected at most {DELAY_SAMPLES}")
+    for i, effect in enumerate(result, start=1):
+        try:
+            EffectStream(effect, period_s / 60.0)
+        except ModelError as error:
+            raise ModelError(f"effect {i}: {effect.kind}: {error}") from error
     return tuple(result)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeGuard
 
@@ -11,9 +12,12 @@ from compensator.errors import ModelError
 
 #: Largest number of values in a list, and of lists in a list, unless a key has a limit of its own.
 LIST_LENGTH = 1000
-#: Longest text, and how a message says so.
-TEXT_LENGTH = 300
+#: Longest text, and how a message says so; longest sentences for people.
+TEXT_LENGTH, WORDS_LENGTH = 300, 10_000
 ONE_LINE = f"at most {TEXT_LENGTH} printable characters"
+
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class TomlTable:
@@ -85,6 +89,14 @@ class TomlTable:
         if not isinstance(values, list) or not values or not all(isinstance(row, list) for row in values):
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected a list of lists of numbers")
         return tuple(() if empty and not row else TomlTable(self.where, {key: row}).numbers(key) for row in values)
+
+    def words(self, key: str) -> str:
+        """Return sentences for people, without control characters."""
+        value = self.table.get(key)
+        if not isinstance(value, str) or len(value) > WORDS_LENGTH or _CONTROL.search(value):
+            expected = f"a string of at most {WORDS_LENGTH} characters without control characters"
+            raise ModelError(f"{self.where}: {key} = {shown(value)}, expected {expected}")
+        return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of strings."""

@@ -367,6 +367,35 @@ def test_unknown_effect_is_named() -> None:
 
 TEXT = load_model.__globals__["read_model_bytes"]("quill").decode()
 
+INPUT = 'kind = "input"\nchannel = "fan_rpm"\ncurve = "linear"\ndelay_min = 0\n'
+DRIVE = 'kind = "nonlinear"\nform = "drive"\npath = "DTF"\nchange = 0.01\nb = [0.1]\n'
+GAIN = 'kind = "gain"\npath = "DTF"\nchange = 0.1\n'
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        (INPUT + "tau_min = [1.0, 2.0]\ngain = [1.0]\n", "effect 2: input: a filter bank: 2 tau_min for 1 gain"),
+        (DRIVE + "a = [2.0, -0.9]\n", "effect 2: nonlinear: .* starts with 1"),
+        (DRIVE + "a = [1.0, -0.9]\nstd_factor = [[0.0, 0.0, 0.1, 0.0]]\n", "effect 2: nonlinear: .* starts with 1"),
+        (GAIN + "explanation = 5\n", "effect gain: explanation = 5, expected a string"),
+        (GAIN + 'explanation = "\\u001b[2J"\n', "without control characters"),
+        (GAIN + f'explanation = "{"x" * 10_001}"\n', "at most 10000 characters"),
+        (GAIN + "std = 3\n", "effect gain: std: expected a table, got 3"),
+        (GAIN + "std = { change = nan }\n", "effect gain: std: change = nan, expected a number"),
+        (GAIN + "std = { change = [1.0, inf] }\n", "effect gain: std: change = .*, expected a list of numbers"),
+    ],
+)
+def test_an_effect_that_cannot_run_or_be_shown_is_refused_with_its_file(effect: str, expected: str) -> None:
+    with pytest.raises(ModelError, match=f"^written: {expected}" if expected.startswith("effect") else expected):
+        parse_model(f"{TEXT}\n[[effect]]\n{GAIN}\n[[effect]]\n{effect}".encode(), source="written")
+
+
+def test_what_a_diagnosis_found_of_an_effect_is_read() -> None:
+    found = 'std = { change = 1, taus = [2.0, 3.0] }\nexplanation = "4 µm: too high."\n'
+    [effect] = parse_model(f"{TEXT}\n[[effect]]\n{GAIN}{found}".encode(), source="written").effects
+    assert effect.std == {"change": 1.0, "taus": [2.0, 3.0]} and effect.explanation == "4 µm: too high."
+
 
 @pytest.mark.parametrize(
     ("old", "new", "expected"),

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from
+from compensator.model.effects.gain import Gain
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model, write_model
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
@@ -73,13 +74,17 @@ def test_effects_and_nested_provenance_survive():
     model = direct_model(
         effects=(
             effect_from("input", INPUT),
-            effect_from("gain", GAIN | {"std": {"gain": 0.5, "parts": [[1.0, 2.0], [3.0, 4.0]], "on": True}}),
+            effect_from("gain", GAIN | {"std": {"gain": 0.5, "parts": [1.0, 2.0]}}),
             effect_from("gain", GAIN | {"form": "ignored", "explanation": "Too low: µm."}),
         ),
-        provenance={"data": [{"file": "a b.csv", "rows": 7}], "odd key": {"x y": "z"}, "empty": []},
+        provenance={
+            "data": [{"file": "a b.csv", "rows": 7}],
+            "empty": [],
+            "odd key": {"x y": "z", "parts": [[1.0, 2.0], [3.0]], "on": True},
+        },
     )
     assert read_back(model) == model
-    assert read_back(model).effects[1].std["on"] is True  # 1 == True
+    assert read_back(model).provenance["odd key"]["on"] is True  # 1 == True
     assert read_back(model).effects[2].explanation == "Too low: µm."
     assert read_back(model).effects[0].to_table() == INPUT
 
@@ -114,7 +119,7 @@ def test_dates_that_an_engineer_wrote_survive():
         ({"provenance": {"noise": {"std": math.nan}}}, r"provenance\.noise\.std = nan"),
         ({"validity": {"at_degc": (15.0, math.inf)}}, r"validity\.at_degc = inf"),
         ({"y_std_um": math.nan}, r"uncertainty\.y_std_um = nan"),
-        ({"effects": (effect_from("gain", GAIN | {"std": {"parts": [[-math.inf]]}}),)}, r"effect 1\.std\.parts = -inf"),
+        ({"effects": (Gain(path="DTF", change=0.1, std={"parts": [-math.inf]}),)}, r"effect 1\.std\.parts = -inf"),
         ({"dtf": dataclasses.replace(SAMPLED, covariance=((math.nan,) * 3,) * 3)}, r"paths\.DTF\.covariance = nan"),
     ],
 )

@@ -31,8 +31,22 @@ MODES = 64
 Run = Callable[..., S]
 #: What is no channel: T_Q and AT act by the paths, and measured deformation is never fed back.
 REFUSED = ("t_q_degc", "at_degc", "y_um", "")
-#: Keys that a diagnosis gives every effect in the model file.
-_FOUND = ("std", "std_factor", "explanation")
+
+
+def _standard_errors(table: TomlTable, key: str) -> dict[str, Any]:
+    found = TomlTable(f"{table.where}: {key}", table.table[key])
+    return {
+        name: list(found.numbers(name)) if isinstance(value, list) else found.number(name)
+        for name, value in found.table.items()
+    }
+
+
+#: Keys that a diagnosis gives every effect in the model file, and how each is read.
+_FOUND: Mapping[str, Callable[[TomlTable, str], Any]] = {
+    "std": _standard_errors,
+    "std_factor": lambda table, key: table.rows(key, empty=True),
+    "explanation": lambda table, key: table.words(key),
+}
 
 
 def number(low: float = -math.inf, high: float = math.inf) -> Any:
@@ -397,9 +411,7 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     named = not plain or (choices and "form" in table)
     form = choices[keys.text("form", tuple(choices))] if named else plain[0]
     read = {f.name: f.metadata["read"](keys, f.name) for f in _read(form)}
-    found = {key: table[key] for key in _FOUND if key in table and key not in read}
-    if "std_factor" in found:
-        found["std_factor"] = keys.rows("std_factor", empty=True)
+    found = {key: _FOUND[key](keys, key) for key in _FOUND if key in table and key not in read}
     effect = form(**read, **found)
     if not effect.has_variance:
         _check_moved(effect)
