@@ -301,9 +301,10 @@ def _check_path(model: ThermalModel, name: str, path: Path) -> None:
             f"model {model.name}: path {name} is sampled at {path.sampled.period_s:g} s, "
             f"the model at {model.period_s:g} s"
         )
-    if not path.sampled.is_stable():
-        worst = max(path.sampled.poles(), key=abs)
-        raise ModelError(f"model {model.name}: path {name} is unstable: pole at z = {worst:.6g}, expected |z| < 1")
+    try:
+        path.sampled.check_stable()
+    except ModelError as error:
+        raise ModelError(f"model {model.name}: path {name} is {error}") from error
 
 
 def check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:

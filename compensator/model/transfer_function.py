@@ -116,6 +116,17 @@ class SampledTransferFunction:
         """Return whether every pole lies inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1.0))
 
+    def check_stable(self) -> None:
+        """Refuse poles outside of the unit circle.
+
+        Raises
+        ------
+        ModelError
+            Naming the worst of them.
+        """
+        if not self.is_stable():
+            raise ModelError(f"unstable: pole at z = {max(self.poles(), key=abs):.6g}, expected |z| < 1")
+
     def times(self, other: SampledTransferFunction) -> SampledTransferFunction:
         """Return this function and another of the same period in series."""
         return SampledTransferFunction(

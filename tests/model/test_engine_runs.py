@@ -369,6 +369,10 @@ TEXT = load_model.__globals__["read_model_bytes"]("quill").decode()
 
 INPUT = 'kind = "input"\nchannel = "fan_rpm"\ncurve = "linear"\ndelay_min = 0\n'
 DRIVE = 'kind = "nonlinear"\nform = "drive"\npath = "DTF"\nchange = 0.01\nb = [0.1]\n'
+SCHEDULED = (
+    'kind = "scheduled"\nform = "drive"\npath = "DTF"\nchannel = "fan_rpm"\norigin = "zero"\nspan = 1\n'
+    "change = 1\nb = [0.1]\n"
+)
 GAIN = 'kind = "gain"\npath = "DTF"\nchange = 0.1\n'
 
 
@@ -378,6 +382,9 @@ GAIN = 'kind = "gain"\npath = "DTF"\nchange = 0.1\n'
         (INPUT + "tau_min = [1.0, 2.0]\ngain = [1.0]\n", "effect 2: input: a filter bank: 2 tau_min for 1 gain"),
         (DRIVE + "a = [2.0, -0.9]\n", "effect 2: nonlinear: .* starts with 1"),
         (DRIVE + "a = [1.0, -0.9]\nstd_factor = [[0.0, 0.0, 0.1, 0.0]]\n", "effect 2: nonlinear: .* starts with 1"),
+        (DRIVE + "a = [1.0, -1.01]\n", "effect 2: nonlinear: unstable: pole at z = 1.01"),
+        (DRIVE + "a = [1.0, -0.9]\nstd_factor = [[0.0, 0.0, 0.0, -0.1]]\n", "effect 2: nonlinear: unstable: pole"),
+        (SCHEDULED + "a = [1.0, 0.0, 1.0]\n", "effect 2: scheduled: unstable: pole at z = .*1j, expected"),
         (GAIN + "explanation = 5\n", "effect gain: explanation = 5, expected a string"),
         (GAIN + 'explanation = "\\u001b[2J"\n', "without control characters"),
         (GAIN + f'explanation = "{"x" * 10_001}"\n', "at most 10000 characters"),

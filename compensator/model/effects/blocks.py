@@ -317,9 +317,16 @@ def shifted(u: Vector, samples: float) -> Vector:
 
 
 class Function(Block):
-    """A sampled transfer function from rest, transposed direct form II."""
+    """A sampled transfer function from rest, transposed direct form II.
+
+    Raises
+    ------
+    ModelError
+        If it is unstable.
+    """
 
     def __init__(self, function: SampledTransferFunction) -> None:
+        function.check_stable()
         n = function.order
         self._function = function
         self._b = (*function.b, *([0.0] * (n + 1 - len(function.b))))
