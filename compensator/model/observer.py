@@ -113,6 +113,11 @@ class Observer:
             ttf, dtf, nothing = self._behind.times(ttf), self._behind.times(dtf), _ZERO
             further = [self._behind.times(f) if i % 2 == 0 else f for i, f in enumerate(further)]
             further += [self._behind, nothing]
+        t_q_var_k2 = estimator.t_q_noise_std_k**2
+        if late is not None and not late.of_ambient and late.samples(model.period_s) and estimator.method == "kalman":
+            # T_Q gets the change of AT over the dead time, with the noise of both ends (`LateObserver.step`); the
+            # plain inverse takes that of the earlier one off again.
+            t_q_var_k2 += 2.0 * estimator.at_noise_std_k**2
         self._lay_out(ttf, dtf, tdtf, ambient, *further)
         self._outputs = self._output_rows(model)
         self._covariance = Covariance(
@@ -122,7 +127,7 @@ class Observer:
                 feed=tuple(self._d),
                 of_y=self._of_y(1.0, 1.0),
                 walk=(*[0.0] * self._q, walk_std**2, estimator.at_walk_std_k**2),
-                t_q_var_k2=estimator.t_q_noise_std_k**2,
+                t_q_var_k2=t_q_var_k2,
                 at_var_k2=estimator.at_noise_std_k**2,
                 kalman=estimator.method == "kalman",
             )

@@ -128,6 +128,25 @@ def test_the_deviation_is_exact_on_a_machine_that_is_as_the_filter_takes_it_to_b
     assert low < rms((y_pred - y)[50:] / std[50:]) < 1.1
 
 
+def test_the_noise_of_at_counts_where_the_heat_alone_is_late() -> None:
+    """The filter gets T_Q with the change of AT over the dead time, and so with its noise of both ends."""
+    noise_k = 0.3
+    settings = dataclasses.replace(
+        with_method("kalman").estimator, at_noise_std_k=noise_k, drive_walk_std=0.5, at_walk_std_k=0.01
+    )
+    model = late(dataclasses.replace(QUILL, estimator=settings, y_std_um=0.0), form="path", lag_min=0.0, delay_min=4.0)
+    rng, n = np.random.default_rng(6), 4000
+    heat, ambient = (np.cumsum(std * rng.normal(size=n)) for std in (0.5, 0.01))
+    assert QUILL.ttf is not None and QUILL.tdtf is not None
+    t_q = np.concatenate((np.zeros(4), QUILL.ttf.sampled.response(heat)[:-4])) + ambient
+    t_q += settings.t_q_noise_std_k * rng.normal(size=n)
+    y = QUILL.dtf.sampled.response(heat) + QUILL.tdtf.sampled.response(ambient)
+    y_pred, std = predicted(model, 20.0 + t_q, 20.0 + ambient + noise_k * rng.normal(size=n))
+    error_um = rms((y_pred - y)[500:])
+    assert 0.7 < error_um / std[-1] < 1.0
+    assert error_um < 0.9
+
+
 @pytest.mark.parametrize("form", ["sensor", "path"])
 def test_a_direct_model_too(form: str) -> None:
     base = direct("kalman")
