@@ -8,7 +8,7 @@ from typing import Any
 
 from compensator.model.correction.mixture import Mixture
 
-#: So many refused probes that agree are believed; two before a second probe was taken.
+#: So many refused probes that agree are believed; two before a first probe was taken.
 AGREEING = 3
 #: Refused probes that lie further apart than this do not support each other, min.
 AGREEING_WITHIN_MIN = 720.0
