@@ -131,8 +131,8 @@ def _warmed(engine: Engine, t_q_degc: float, at_degc: float, channels: Mapping[s
     model = engine.model
     paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
     taus = [tau for path in paths for tau in path.sampled.time_constants_min()]
-    slowest = max([*taus, *(tau for effect in model.effects for tau in effect.time_constants_min)])
-    samples = math.ceil(60.0 * slowest / model.period_s)
+    slowest = max([*taus, *(tau for effect in model.effects for tau in effect.time_constants_min)], default=0.0)
+    samples = max(1, math.ceil(60.0 * slowest / model.period_s))
     share = np.minimum(np.arange(SETTLED * samples) / samples, 1.0)
     still = {name: np.full(share.size, value) for name, value in channels.items()}
     air = np.full(share.size, at_degc)

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from scipy import linalg, signal
 
+from compensator.data.record import SampledRecord
 from compensator.errors import ModelError
 from compensator.model.effects import Effect, effect_from, kinds, register
 from compensator.model.effects.base import number, text
 from compensator.model.effects.blocks import Block
 from compensator.model.engine import Engine, Estimate, wrong_histories
 from compensator.model.model_file import load_model, parse_model
+from compensator.model.simulation import simulate
 from compensator.model.thermal_model import ThermalModel
 
 QUILL = load_model("quill")
@@ -195,6 +197,27 @@ at_walk_std_k = 0.01
     run = engine.run(np.full(600, 27.0), np.full(600, 20.0))
     assert run[-1].y_um == pytest.approx(20.0, abs=1e-3)
     assert all(math.isnan(e.heat_w) for e in run)
+
+
+@pytest.mark.parametrize(("b", "a"), [([2.0], [1.0]), ([1.5, 0.5], [1.0, 0.0])])
+def test_a_model_without_a_time_constant_is_simulated_from_rest(b: list[float], a: list[float]) -> None:
+    text = f"""
+schema = 1
+name = "direct"
+kind = "direct"
+sample_period_s = 60.0
+paths.DTF = {{ unit = "um/K", form = "sampled", b = {b}, a = {a} }}
+[estimator]
+method = "inverse"
+t_q_noise_std_k = 0.02
+at_noise_std_k = 0.02
+difference_walk_std_k = 0.2
+at_walk_std_k = 0.01
+"""
+    t_q = np.repeat([25.0, 27.0], 5)
+    record = SampledRecord(t_s=60.0 * np.arange(10), columns={"t_q_degc": t_q, "at_degc": np.full(10, 20.0)})
+    y = simulate(parse_model(text.encode(), source="test"), record, from_rest=True)["y_pred_um"]
+    assert y[[0, -1]] == pytest.approx([0.0, 4.0])
 
 
 class Slow(Block):
