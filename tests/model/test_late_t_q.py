@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from
+from compensator.model.effects.lateness import Lateness
 from compensator.model.engine import Engine
 from compensator.model.late_observer import observe, observer_of
 from compensator.model.model_file import load_model, parse_model
@@ -145,6 +146,16 @@ def test_the_noise_of_at_counts_where_the_heat_alone_is_late() -> None:
     error_um = rms((y_pred - y)[500:])
     assert 0.7 < error_um / std[-1] < 1.0
     assert error_um < 0.9
+
+
+@pytest.mark.parametrize(("period_s", "delay_min", "samples"), [(5.0, 0.3333333333, 4), (5.0, 49 * 5 / 60, 49)])
+def test_a_dead_time_of_whole_samples_is_not_split_by_rounding(period_s: float, delay_min: float, samples: int) -> None:
+    lateness = Lateness(lag_min=0.0, delay_min=delay_min, of_ambient=True)
+    assert lateness.samples(period_s) == samples
+    assert lateness.within_a_sample(period_s, invertible=False).order == 0
+    part = Lateness(lag_min=0.0, delay_min=delay_min + 0.01, of_ambient=True)
+    assert part.samples(period_s) == samples
+    assert part.within_a_sample(period_s, invertible=False).b == pytest.approx((0.88, 0.12))
 
 
 @pytest.mark.parametrize("form", ["sensor", "path"])

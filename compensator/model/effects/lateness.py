@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from compensator.model.transfer_function import SampledTransferFunction
 
+#: A dead time that is as near to whole samples is one of them: 0.3333333333 min are 4 samples of 5 s.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lateness:
@@ -35,7 +38,15 @@ class Lateness:
 
     def samples(self, period_s: float) -> int:
         """Return the whole samples of the dead time."""
-        return math.floor(self.delay_min * 60.0 / period_s)
+        return self._split(period_s)[0]
+
+    def _split(self, period_s: float) -> tuple[int, float]:
+        """Return the dead time in whole samples, and what they leave of it, in samples."""
+        samples = self.delay_min * 60.0 / period_s
+        if abs(samples - round(samples)) < _ROUNDING:
+            return round(samples), 0.0
+        whole = math.floor(samples)
+        return whole, samples - whole
 
     def behind(self, period_s: float) -> SampledTransferFunction | None:
         """Return the lag of T_Q − AT behind what changes, if it has one."""
@@ -54,7 +65,7 @@ class Lateness:
         invertible : bool
             Whether it will be inverted.
         """
-        part = self.delay_min * 60.0 / period_s - self.samples(period_s)
+        part = self._split(period_s)[1]
         function = _lag(self.lag_min * 60.0 / period_s, period_s)
         if part == 0.0:
             return function
