@@ -75,7 +75,7 @@ def test_effects_and_nested_provenance_survive():
         effects=(
             effect_from("input", INPUT),
             effect_from("gain", GAIN | {"std": {"gain": 0.5, "parts": [1.0, 2.0]}}),
-            effect_from("gain", GAIN | {"form": "ignored", "explanation": "Too low: µm."}),
+            effect_from("gain", GAIN | {"explanation": "Too low: µm."}),
         ),
         provenance={
             "data": [{"file": "a b.csv", "rows": 7}],

@@ -410,6 +410,8 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     plain = [form for form in candidates if not _choices(form)]
     named = not plain or (choices and "form" in table)
     form = choices[keys.text("form", tuple(choices))] if named else plain[0]
+    # A key of another form would be lost when the model is written.
+    keys = TomlTable(keys.where, table, tuple(dict.fromkeys([*(f.name for f in _read(form)), *_FOUND])))
     read = {f.name: f.metadata["read"](keys, f.name) for f in _read(form)}
     found = {key: _FOUND[key](keys, key) for key in _FOUND if key in table and key not in read}
     effect = form(**read, **found)
