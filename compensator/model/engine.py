@@ -467,7 +467,8 @@ class Engine:
     def takes_y(self) -> bool:
         """Whether the state can be corrected by a measured deformation: it is not that of some samples before.
 
-        Nor does an effect remember what the paths have done: a correction would not reach that.
+        Nor does a `hysteresis` or a delayed path remember what the paths have done, which a correction does not reach.
+        A lag of what they have done (`dynamics`, `scheduled`) does not keep it from being corrected: it forgets.
         """
         has_memory = any(
             one.kind in ("hysteresis", "delay") and one.effect.lateness is None for one in self._parts[0].effects

@@ -332,5 +332,5 @@ def check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
     if abs(worst) >= 1.0:
         raise ModelError(where + f"zero at z = {worst:.6g} makes the inverse unstable, expected |z| < 1")
     ringing = min(zeros, key=lambda z: float(np.real(z)))
-    if ringing.real < RINGING_LIMIT:
+    if ringing.real <= RINGING_LIMIT:
         raise ModelError(where + f"zero at z = {ringing:.6g} makes the inverse ring, expected Re z > {RINGING_LIMIT}")

@@ -446,6 +446,11 @@ def test_what_a_diagnosis_found_of_an_effect_is_read() -> None:
             "inverse ring",
         ),
         (
+            'form = "continuous"\nnumerator = [0.0002567, 0.01629, 0.008079]\ndenominator = [0.001022, 0.09112, 1.0]',
+            'form = "sampled"\nb = [0.01, 0.008]\na = [1.0, -0.9]',
+            "makes the inverse ring",
+        ),
+        (
             "numerator = [0.0002567, 0.01629, 0.008079]",
             "numerator = [0.0002567, -0.01629]",
             "inverse unstable",

@@ -7,8 +7,8 @@ row      y += Σ_i L(τ_i) · (gain_i · c · drive + gain_share_i · c · y_pat
 film     y += Σ_i L(τ_i) · (gain_i · X(|c|, drive) + gain_share_i · X(|c|, y_path))
 
 with X what a film exchanges whose surface follows (`Exchange`), and c the channel in units of its own span: as it is
-where it has a zero of its own (a speed, a flow); as its change from where the record began that showed it where
-it has none (a temperature, a pump that always runs).
+where it has a zero of its own (a speed, a flow); where it has none (a temperature, a pump that always runs) as its
+change from `origin`, the number at which the record of the diagnosis began, or with "start" its first value.
 """
 
 from __future__ import annotations
