@@ -37,7 +37,12 @@ def test_check_prints_the_lines_that_are_missing(tmp_path: Path, capfd: pytest.C
 
     # With the lines in the configuration, and a device for them, the model can run.
     config = tmp_path / "machine.toml"
-    lines = pasted.replace('"DEVICE"', '"thermocouples"')
+    units = [name.rpartition("_")[2] for name in missing]
+    inputs = [f'{{ input = {i}, unit = "{unit}", address = {i}, type = "int16" }}' for i, unit in enumerate(units)]
+    lines = '[[line]]\nname = "plc"\nprotocol = "modbus-tcp"\nhost = "192.168.10.30"\n[[device]]\nname = "signals"\n'
+    lines += f'line = "plc"\nmodel = "modbus-map"\naddress = 1\ninputs = [{", ".join(inputs)}]\n\n'
+    for i, one in enumerate(pasted.split("\n\n")):
+        lines += one.replace('"DEVICE"\ninput = 0', f'"signals"\ninput = {i}') + "\n\n"
     config.write_text(EXAMPLE.read_text(encoding="utf-8") + lines, encoding="utf-8")
     assert {channel.name for channel in load_config(config).config.channel} >= set(missing)
     assert main(["check", "--config", str(config), "--model", str(MODEL)]) == 0
