@@ -85,7 +85,7 @@ class Guards(_Table, frozen=True, kw_only=True):
     `suspect_jumps`: after a change beyond `rate_max_per_min` the channel is not used until its new value is confirmed;
     by default it is used again as soon as the permitted change, which grows with the time, includes its value.
     `jump_min_k`: a smaller jump, too, down to this one, makes T_Q suspect if the next samples show that it is no change
-    of the heat, and AT unconfirmed if T_Q does not follow; needs `suspect_jumps`.
+    of the heat, and AT unconfirmed if T_Q does not follow; a change below it is none. Needs `suspect_jumps`.
     """
 
     t_q_below_at_max_k: Kelvins

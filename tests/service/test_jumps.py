@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,14 @@ import msgspec
 import numpy as np
 import pytest
 
+import compensator.model
 from compensator.cli import main
 from compensator.config import parse_config
 from compensator.errors import ConfigError
 from compensator.messages import EstimateMessage, encode, number
-from compensator.service.compensation import Compensation
+from compensator.model.model_file import parse_model
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -269,6 +273,53 @@ def test_what_is_left_of_a_jump_that_was_within_the_permitted_rate_is_not_believ
     outcomes = run(day, change, channel=channels)
     wrong = np.abs(offsets(outcomes) - undisturbed()) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
+
+
+@pytest.mark.parametrize("samples", [1, 5])
+@pytest.mark.parametrize("size", [0.6, 0.9])
+def test_a_change_below_the_smallest_jump_is_none(day: dict[str, np.ndarray], size: float, samples: int) -> None:
+    """What is expected of AT is too uncertain to show the return from so small a jump: it would be held for good."""
+    channels = [c | {"rate_max_per_min": 0.5} if c["name"] == "at_degc" else c for c in CHANNELS]
+    outcomes = run(day, biased("at_degc", size, end=BEGIN + samples), channel=channels)
+    assert {o.offset.state for o in outcomes} == {"ok"}
+    assert np.max(np.abs(offsets(outcomes) - undisturbed())) < 2.5
+    # A larger one still is.
+    larger = run(day, biased("at_degc", 1.2, end=BEGIN + samples), channel=channels)
+    assert events(larger, "jumped") == [BEGIN]
+
+
+@functools.cache
+def short_samples(period_s: float, hours: float) -> tuple[ThermalModel, dict[str, np.ndarray]]:
+    """The published machine with a model of shorter samples, and a morning of it."""
+    text = (Path(compensator.model.__file__).parent / "quill.toml").read_text(encoding="utf-8")
+    less = math.sqrt(period_s / 60.0)
+    for before, after in (
+        ("sample_period_s = 60.0", f"sample_period_s = {period_s}"),
+        ("heat_walk_std_w = 4.0", f"heat_walk_std_w = {4.0 * less}"),
+        ("at_walk_std_k = 0.1", f"at_walk_std_k = {0.1 * less}"),
+    ):
+        assert before in text
+        text = text.replace(before, after)
+    duty = Duty.working_day(3, hours=hours)
+    record = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 3).record(period_s)
+    return parse_model(text.encode(), source="short"), record
+
+
+def short_run(period_s: float, hours: float, change: Change = lambda i, v: None) -> list[Outcome]:
+    model, columns = short_samples(period_s, hours)
+    found, outcomes = Compensation(settings(), model), []
+    for i in range(len(columns["t_s"])):
+        values = readings(columns, i) | {"y_um": math.nan}
+        change(i, values)
+        outcomes.append(found.process(msgspec.structs.replace(sample(i, values), period_s=period_s)))
+    return outcomes
+
+
+def test_samples_of_seconds_make_no_jump_of_noise_and_of_heat_that_is_switched() -> None:
+    """In 5 s the usual rates permit T_Q 0.4 and AT 0.2 K."""
+    outcomes = short_run(5.0, 2.0)
+    assert {o.offset.state for o in outcomes} == {"ok"}
+    assert events(short_run(5.0, 2.0, biased("t_q_degc", 4.0, begin=600, end=1200)), "jumped") == [600]
 
 
 def test_a_pause_is_no_sample_of_a_return(day: dict[str, np.ndarray]) -> None:

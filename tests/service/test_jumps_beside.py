@@ -218,12 +218,18 @@ def test_probes_that_are_right_never_confirm_a_sensor_that_is_wrong(day: dict[st
 
 
 def probed_day(
-    day: dict[str, np.ndarray], probes: dict[int, float], *, rate_max: float = 5.0, fault_k: float = 0.0
+    day: dict[str, np.ndarray],
+    probes: dict[int, float],
+    *,
+    rate_max: float = 5.0,
+    least_k: float = 1.0,
+    fault_k: float = 0.0,
 ) -> list[Outcome]:
     """Run a day without measured Y: probes by sample with what each is wrong by, T_Q off by a fault from BEGIN on."""
     probe = Probe(std_um=1.0, measured_max_um=200.0, largest_um=40.0, tolerance_um=3.0)
     channels = [c | {"rate_max_per_min": rate_max} if c["name"] == "t_q_degc" else c for c in CHANNELS]
-    compensation = Compensation(msgspec.structs.replace(settings(channel=channels), probe=probe), QUILL)
+    guarded = msgspec.structs.replace(settings(channel=channels, jump_min_k=least_k), probe=probe)
+    compensation = Compensation(guarded, QUILL)
     outcomes: list[Outcome] = []
     last = None
     for i in range(END):
@@ -243,7 +249,7 @@ def probed_day(
 def test_probes_while_the_offset_is_held_end_the_doubt_of_a_channel_that_is_right(day: dict[str, np.ndarray]) -> None:
     """T_Q heats faster than permitted, so it is suspected; the offset is held, and 80 µm wrong by then."""
     hourly = {30: 0.0, 90: 0.0, 150: 0.0, 210: 0.0}
-    outcomes = probed_day(day, hourly, rate_max=0.5)
+    outcomes = probed_day(day, hourly, rate_max=0.5, least_k=0.5)
     states = [o.offset.state for o in outcomes]
     assert states[60] == states[150] == "hold", states[60:152]
     assert [p.code for o in outcomes[90:160] for p in o.probes] == 2 * ["probe_during_hold", "probe_duplicate"]
@@ -251,7 +257,7 @@ def test_probes_while_the_offset_is_held_end_the_doubt_of_a_channel_that_is_righ
     wrong_um = np.abs(offsets(outcomes) - undisturbed()[:END])
     assert np.max(wrong_um[100:140]) > 40.0 and np.max(wrong_um[160:260]) < 5.0
     # One that has met a chip is not one of two.
-    chip = probed_day(day, hourly | {90: 15.0}, rate_max=0.5)
+    chip = probed_day(day, hourly | {90: 15.0}, rate_max=0.5, least_k=0.5)
     assert chip[155].offset.state == "hold" and chip[215].offset.state == "degraded"
 
 

@@ -25,11 +25,14 @@ GuardState = tuple[float, float, float, float]
 class ChannelGuard:
     """Guard of range, rate and constant values of one channel; `period_min` is the length of a sample, min.
 
-    With `suspects_jumps` the permitted change grows with the square root of the time without a value.
+    With `suspects_jumps` the permitted change grows with the square root of the time without a value, and is at least
+    `jump_min_k`, K.
     """
 
-    def __init__(self, channel: Channel, period_min: float, *, suspects_jumps: bool = False) -> None:
-        self._suspects_jumps = suspects_jumps
+    def __init__(
+        self, channel: Channel, period_min: float, *, suspects_jumps: bool = False, jump_min_k: float = 0.0
+    ) -> None:
+        self._suspects_jumps, self._jump_min_k = suspects_jumps, jump_min_k
         self._channel = channel
         self._period_min = period_min
         self._last_good = math.nan
@@ -60,14 +63,19 @@ class ChannelGuard:
         if channel.rate_max_per_min is not None and not math.isnan(self._last_good):
             # The permitted change grows with the time since the last good value: a sensor that returns after a long
             # loss is accepted again, a jump is not.
-            allowed = channel.rate_max_per_min * self._growth_min
+            # A change below the smallest jump is none, however short a sample is: the noise of a sensor does not shrink
+            # with it, and the return from so small a jump could not be told.
+            allowed = max(channel.rate_max_per_min * self._growth_min, self._jump_min_k)
             if abs(mean - self._last_good) > allowed:
                 return SampleQuality.TOO_FAST
         return SampleQuality.GOOD
 
     @property
     def _growth_min(self) -> float:
-        """Time for which the channel is permitted to change at its largest rate, min."""
+        """Factor of the largest rate in the permitted change, min: the time since the last good value.
+
+        Where jumps are watched, a sample times the square root of the number of samples since then.
+        """
         if not self._suspects_jumps:
             return self._since_good_min
         # The straight growth would permit any fault after an open contact of a few samples.
@@ -104,10 +112,11 @@ class SensorGuards:
     """All guards of a machine; `period_min` is the length of a sample, min."""
 
     def __init__(self, channels: list[Channel], guards: Guards, period_min: float) -> None:
+        watched = TEMPERATURES if guards.suspect_jumps else ()
         self._guards = {
-            channel.name: ChannelGuard(
-                channel, period_min, suspects_jumps=guards.suspect_jumps and channel.name in TEMPERATURES
-            )
+            channel.name: ChannelGuard(channel, period_min, suspects_jumps=True, jump_min_k=guards.jump_min_k or 0.0)
+            if channel.name in watched
+            else ChannelGuard(channel, period_min)
             for channel in channels
         }
         self._limits = guards
