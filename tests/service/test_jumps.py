@@ -322,6 +322,14 @@ def test_samples_of_seconds_make_no_jump_of_noise_and_of_heat_that_is_switched()
     assert events(short_run(5.0, 2.0, biased("t_q_degc", 4.0, begin=600, end=1200)), "jumped") == [600]
 
 
+def test_samples_of_seconds_make_no_loose_contact_of_heat_that_is_switched() -> None:
+    """T_Q follows its temperature, 5 K off: a loose contact would be used again once it rests, and still wrong."""
+    outcomes = short_run(5.0, 2.0, biased("t_q_degc", 5.0, begin=480, end=960))
+    assert events(outcomes, "jumped") == [480]
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[480:960])
+    assert events(outcomes, "accepted") == [962]
+
+
 def test_a_pause_is_no_sample_of_a_return(day: dict[str, np.ndarray]) -> None:
     outcomes = run(day, biased("t_q_degc", 8.0), lambda i, c: c.pause(2) if i == END + 2 else None)
     assert events(outcomes, "accepted") == [END + 4]

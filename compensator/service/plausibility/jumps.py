@@ -26,7 +26,8 @@ from compensator.service.plausibility.jump_signs import JumpSigns, accepted_note
 from compensator.service.plausibility.jump_state import JumpState
 from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
 
-#: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
+#: Part of the permitted change, or of the smallest jump if that is more, that the temperature itself makes; beyond it a
+#: suspect channel has jumped again.
 _NATURAL = 0.5
 #: Weight of a new residual in the level before a jump, and of the difference of two in a row in the noise of Y; at
 #: most so many deviations of it count, for a chip is no noise.
@@ -48,7 +49,7 @@ class JumpWatch:
             signs=JumpSigns(model, least_k) if least_k is not None else None,
             least_k=math.inf if least_k is None else least_k,
             change_k={
-                channel.name: _NATURAL * (channel.rate_max_per_min or math.inf) * period_min
+                channel.name: _NATURAL * max((channel.rate_max_per_min or math.inf) * period_min, least_k or 0.0)
                 for channel in config.channel
                 if channel.name in TEMPERATURES
             },
