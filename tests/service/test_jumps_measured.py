@@ -106,6 +106,30 @@ def test_a_channel_that_is_wrong_from_its_jump_on_was_not_wrong_before(
     assert all(f"suspect_channel:{channel}" in o.offset.reasons for o in outcomes[301:])
 
 
+@pytest.mark.parametrize(
+    ("begin", "at_k", "end", "loose_from", "t_q_k", "on"),
+    [
+        (251, 4.0, 328, 244, 5.0, {4, 8, 10, 13, 14}),
+        (282, 3.0, 368, 280, 3.75, {0, 4, 6, 7, 9, 13, 14}),
+        (491, 3.0, 544, 488, 3.0, {4, 6, 8, 11, 12}),
+    ],
+)
+def test_the_model_confirms_nothing_that_measured_y_contradicts(
+    day: dict[str, np.ndarray], begin: int, at_k: float, end: int, loose_from: int, t_q_k: float, on: set[int]
+) -> None:
+    """AT jumps while T_Q is a loose contact, `on` in some blocks of three samples: together they look like heat."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["at_degc"] += at_k if begin <= i < end else 0.0
+        values["t_q_degc"] += t_q_k if (i - loose_from) // 3 in on else 0.0
+
+    outcomes = followed(day, change, residual_std_um=0.3, false_alarm_days=30.0)
+    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
+    assert all("suspect_channel:at_degc" in o.offset.reasons for o in outcomes[begin + 1 : end])
+    assert not wrong[end + 60 :].any()
+
+
 def test_what_y_has_shown_since_a_jump_survives_a_restart(day: dict[str, np.ndarray]) -> None:
     change = drifts("t_q_degc", 1.5, 180, 420)
     conf = settings({"false_alarm_days": 30.0})

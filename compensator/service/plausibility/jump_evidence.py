@@ -10,6 +10,8 @@ from compensator.service.plausibility.jump_state import JumpState
 
 #: Log likelihood ratio, and least number of samples, for the model to agree with a channel.
 _AGREES, _AGREES_SAMPLES = 12.0, 10
+#: What agrees then, with its verb.
+MODEL_AGREES = "the model agrees"
 #: Log likelihood ratio at which a jump within the permitted rate is refuted.
 _REFUTED = 12.0
 #: Consecutive samples for which Y must speak for a channel.
@@ -84,7 +86,7 @@ def confirmed_by(state: JumpState) -> str:
     if state.probes_for >= _PROBES or by_y:
         return "probes agree"
     if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
-        return "the model agrees"
+        return MODEL_AGREES
     return ""
 
 

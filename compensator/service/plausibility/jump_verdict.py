@@ -18,7 +18,13 @@ from compensator.service.plausibility.jump_engines import (
     is_unsteady,
     needed_samples,
 )
-from compensator.service.plausibility.jump_evidence import confirmed_by, is_contradicted, is_good_enough, is_unlikely
+from compensator.service.plausibility.jump_evidence import (
+    MODEL_AGREES,
+    confirmed_by,
+    is_contradicted,
+    is_good_enough,
+    is_unlikely,
+)
 from compensator.service.plausibility.jump_signs import (
     AIR,
     AS_USED,
@@ -107,7 +113,7 @@ class JumpJudge:
         if state.at_held >= needed and state.phase != Phase.SUSPECT_AFTER_USE:
             return self._accept(None, "has returned to where it was before")
         by = confirmed_by(state)
-        if by:
+        if by and not (by == MODEL_AGREES and self._is_believing_contradicted(grown_y)):
             return self._accept(engines.believing, f"is used again: {by} with it")
         if is_alone and is_unsteady(state) and state.samples >= needed and engines.may_be(state, offered):
             return self._settle()
@@ -157,6 +163,19 @@ class JumpJudge:
         if math.isnan(offered["t_q_degc"]):
             state.samples -= 1  # nothing but T_Q speaks for or against AT
         return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
+
+    def _is_believing_contradicted(self, grown_y: GrownY) -> bool:
+        """Return whether measured Y contradicts the believing engine, by how it stood before the jump and by the zero.
+
+        Either alone may be what a fault had done before that the jump has mended.
+        """
+        believing = self._engines.believing
+        estimate, at_zero = believing.estimate, believing.at_zero
+        return (
+            estimate is not None
+            and contradicts(grown_y.by_level, grown_y.level_std_um, estimate, at_zero)
+            and contradicts(grown_y.by_zero, grown_y.zero_std_um, estimate, at_zero)
+        )
 
     def _use_as_before(self, others: Mapping[str, float], grown_y: GrownY) -> Verdict | None:
         """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then.
