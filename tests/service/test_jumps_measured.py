@@ -106,6 +106,21 @@ def test_a_channel_that_is_wrong_from_its_jump_on_was_not_wrong_before(
     assert all(f"suspect_channel:{channel}" in o.offset.reasons for o in outcomes[301:])
 
 
+@pytest.mark.parametrize(("size", "y_wrong_um"), [(3.0, 12.0), (3.0, 30.0), (-4.0, -12.0)])
+def test_some_wrong_values_of_y_after_a_jump_make_no_hindsight_of_it(
+    day: dict[str, np.ndarray], size: float, y_wrong_um: float
+) -> None:
+    """A chip for 4 min moves Y the way a channel would that was wrong before its jump."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["t_q_degc"] += size if 300 <= i < 390 else 0.0
+        values["y_um"] += y_wrong_um if 304 <= i < 308 else 0.0
+
+    outcomes = followed(day, change, residual_std_um=0.3, false_alarm_days=30.0)
+    assert all("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[301:390])
+    assert outcomes[400].offset.state == "ok"
+
+
 @pytest.mark.parametrize(
     ("begin", "at_k", "end", "loose_from", "t_q_k", "on"),
     [

@@ -224,7 +224,11 @@ def _stepped(
     grown_um, variance_um2 = y
     if not math.isnan(grown_um):
         residual_um = grown_um - estimate.y_um
-        cost += _cost(residual_um, engine.measure_y(residual_um, variance_um2))
+        expected_um2 = variance_um2 + engine.y_noise_std_um**2
+        # A value that is no measurement (a chip, a hand) would lead the state astray for hours.
+        if residual_um * residual_um < _CLIP2 * expected_um2:
+            expected_um2 = engine.measure_y(residual_um, variance_um2)
+        cost += _cost(residual_um, expected_um2)
     return cost + min(beyond_heat(engine.model, estimate) ** 2, _CLIP2), estimate
 
 
