@@ -29,6 +29,7 @@ from compensator.service.decision import Decision, mean
 from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
     HEATED_W,
+    TEMPERATURES,
     Judgement,
     SensorEvidence,
 )
@@ -281,8 +282,9 @@ class Compensation(Continuity):
             number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
             for channel in (raw.channels.get(name) for name in ("t_q_degc", "at_degc"))
         )
-        # One channel that has jumped is not an exchange of two.
-        below_k = at - t_q if len(self._jumps.suspects) != 1 else NAN
+        # One channel that has jumped is not an exchange of two, nor is one that reads what neither of them can.
+        is_of_one = len(self._jumps.suspects) == 1 or not (self._can_be_exchanged(t_q) and self._can_be_exchanged(at))
+        below_k = NAN if is_of_one else at - t_q
         reference = self._engine.reference
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
         # A prediction without both temperatures, or from an unknown state, is not evidence against a sensor.
@@ -295,6 +297,13 @@ class Compensation(Continuity):
             std_um=prediction.std_um,
             predicted_um=prediction.y_um,
         )
+
+    def _can_be_exchanged(self, degc: float) -> bool:
+        """Return whether a reading is within the range of T_Q or of AT: that of the other one alone is an exchange."""
+        if not self._jumps.is_on:  # version 0.1.0 did not ask: an audit of its recordings comes to the same states
+            return True
+        ranges = [channel.range for channel in self._config.channel if channel.name in TEMPERATURES]
+        return any(one is None or one[0] <= degc <= one[1] for one in ranges)
 
     def _set_zero(self, time_ns: int, values: Values, notes: list[Note]) -> None:
         zero = self._zero

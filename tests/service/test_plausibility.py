@@ -305,6 +305,24 @@ def test_measured_y_ends_an_exchange_that_is_over(day: dict[str, np.ndarray], ha
         assert max(map(abs, left_um[over + 20 :])) < 5.0
 
 
+@pytest.mark.parametrize(("t_q_degc", "is_exchange"), [(-5.0, False), (12.0, True)])
+def test_what_neither_channel_can_read_is_no_exchange(
+    day: dict[str, np.ndarray], t_q_degc: float, is_exchange: bool
+) -> None:
+    """A module that fails while it says that it is well; 12 °C, too little for T_Q, is what AT may read."""
+    channels = [c | {"range": [15.0, 80.0]} if c["name"] == "t_q_degc" else c for c in CHANNELS]
+
+    def fails(i: int, values: dict[str, float]) -> None:
+        values["y_um"] = math.nan
+        values["t_q_degc"] = t_q_degc if 200 <= i < 260 else values["t_q_degc"]
+
+    guards = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
+    watched = config(channel=channels, plausibility=LIMITS, loss={"predict_for_min": 60.0}, guards=guards)
+    outcomes = outcomes_of(day, 320, fails, watched)
+    assert first_at(outcomes, "t_q_at_exchanged") == (214 if is_exchange else -1)
+    assert outcomes[-1].offset.state == ("fault" if is_exchange else "degraded")
+
+
 def test_a_couple_that_is_apart_at_rest_is_said(day: dict[str, np.ndarray]) -> None:
     rest = {"channel": "heat_w", "at_most": 1.0, "after_min": 240.0, "t_q_at_max_k": 0.8}
 

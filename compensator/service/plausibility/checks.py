@@ -116,7 +116,7 @@ class SensorEvidence:
     Parameters
     ----------
     below_k : float
-        AT − T_Q as measured, K, regardless of the guards.
+        AT − T_Q as measured, K, regardless of what each may read; NaN where one of them is wrong by itself.
     apart_k : float
         T_Q − AT as a change since the zero, K.
     rest : float
