@@ -27,11 +27,12 @@ LIMITS = {"t_q_below_at_after_min": 15.0, "false_alarm_days": 365.0, "residual_s
 #: No device is silent here, and a busy computer must not look like one that is.
 WIRED: dict[str, Any] = {"plausibility": LIMITS, "timeout_s": 1.0, "is_patient": True}
 CHANNELS = [*TABLE["channel"][:3], {"name": "heat_w", "device": "module", "input": 4}]
+WATCHED = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
 Change = Callable[[int, dict[str, float]], None]
 
 
-def checked(**limits: Any) -> Any:
-    return config(channel=CHANNELS, plausibility={**LIMITS, **limits}, loss={"predict_for_min": 60.0})
+def checked(*, guards: dict[str, Any] = TABLE["guards"], channel: Any = CHANNELS, **limits: Any) -> Any:
+    return config(channel=channel, plausibility={**LIMITS, **limits}, loss={"predict_for_min": 60.0}, guards=guards)
 
 
 @pytest.fixture(scope="module")
@@ -290,9 +291,7 @@ def test_measured_y_ends_an_exchange_that_is_over(day: dict[str, np.ndarray], ha
             values["t_q_degc"], values["at_degc"] = values["at_degc"], values["t_q_degc"]
         values["y_um"] = values["y_um"] if has_y else math.nan
 
-    guards = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
-    watched = config(channel=CHANNELS, plausibility=LIMITS, loss={"predict_for_min": 60.0}, guards=guards)
-    outcomes = outcomes_of(day, 600, exchanged, watched)
+    outcomes = outcomes_of(day, 600, exchanged, checked(guards=WATCHED))
     reasons = [set(o.offset.reasons) for o in outcomes]
     noticed = first_at(outcomes, "t_q_at_exchanged")
     assert 0 < noticed < end - 60
@@ -316,9 +315,7 @@ def test_what_neither_channel_can_read_is_no_exchange(
         values["y_um"] = math.nan
         values["t_q_degc"] = t_q_degc if 200 <= i < 260 else values["t_q_degc"]
 
-    guards = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
-    watched = config(channel=channels, plausibility=LIMITS, loss={"predict_for_min": 60.0}, guards=guards)
-    outcomes = outcomes_of(day, 320, fails, watched)
+    outcomes = outcomes_of(day, 320, fails, checked(guards=WATCHED, channel=channels))
     assert first_at(outcomes, "t_q_at_exchanged") == (214 if is_exchange else -1)
     assert outcomes[-1].offset.state == ("fault" if is_exchange else "degraded")
 
@@ -344,6 +341,32 @@ def test_a_couple_that_is_apart_at_rest_is_said(day: dict[str, np.ndarray]) -> N
     raised = first_at(apart, "t_q_at_apart")
     assert raised == 200 + 240 - 1
     assert apart[-1].offset.state == "degraded" and "suspects: T_Q, AT" in told(apart)[-1][1]
+
+
+RESTS = {"channel": "heat_w", "at_most": 1.0, "after_min": 120.0, "t_q_at_max_k": 1.0}
+
+
+def test_hours_in_which_nothing_shows_rest_are_no_rest(day: dict[str, np.ndarray]) -> None:
+    """The machine rests for 4 h, works for 2 h, of which nothing is known, and stops, hot."""
+    begin, stop = 240, 360
+
+    def change(i: int, values: dict[str, float]) -> None:
+        hot_k = 12.0 * min(max(i - begin, 0), stop - begin) / (stop - begin)
+        values |= {"at_degc": 20.0 + 0.01 * math.sin(i), "t_q_degc": 20.0 + hot_k + 0.01 * math.cos(i)}
+        values |= {"heat_w": math.nan if begin <= i < stop else 0.0, "y_um": math.nan}
+
+    outcomes = outcomes_of(day, 500, change, checked(rest=RESTS, guards=WATCHED))
+    assert first_at(outcomes, "t_q_at_apart") == stop + 120 - 1
+
+
+def test_a_line_that_loses_one_sample_in_twenty_shows_rest(day: dict[str, np.ndarray]) -> None:
+    def change(i: int, values: dict[str, float]) -> None:
+        apart_k = 1.5 if i >= 5 else 0.0
+        values |= {"at_degc": 20.0 + 0.01 * math.sin(i), "t_q_degc": 20.0 + apart_k + 0.01 * math.cos(i)}
+        values |= {"heat_w": math.nan if i % 20 == 10 else 0.0, "y_um": math.nan}
+
+    outcomes = outcomes_of(day, 200, change, checked(rest=RESTS, guards=WATCHED))
+    assert 120 < first_at(outcomes, "t_q_at_apart") < 160
 
 
 # ---------------------------------------------------------------------- state, configuration

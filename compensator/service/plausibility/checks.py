@@ -53,6 +53,9 @@ _RIGHT_BLOCKS, _RIGHT_SHARE, _MOVED = 2, 0.2, 10.0
 #: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
 _EXCESS = 1.166
 _DAY_MIN = 1440.0
+#: A sample without the channel that shows rest takes so many others of the rest that is wanted: the machine may have
+#: worked, but a line that loses one sample in twenty must not switch the check off.
+_REST_UNKNOWN = 3.0
 
 
 #: Names in the state file; states of earlier versions have them too.
@@ -139,8 +142,9 @@ class PlausibilityCheck:
     def __init__(self, config: Config, model: ThermalModel) -> None:
         self._limits = config.plausibility or Plausibility()
         self._below_max_k = config.guards.t_q_below_at_max_k
-        # Version 0.1.0 waited for a person: an audit of its recordings comes to the same states.
-        self._ends_exchange = config.guards.suspect_jumps
+        # Version 0.1.0 waited for a person after an exchange, and counted rest on over hours without its channel: an
+        # audit of its recordings comes to the same states.
+        self._watches_jumps = config.guards.suspect_jumps
         self._period_min = model.period_s / 60.0
         self._model_std_um = model.y_std_um
         measured = any(channel.name == "y_um" for channel in config.channel)
@@ -268,7 +272,12 @@ class PlausibilityCheck:
 
     def _check_rest(self, evidence: SensorEvidence) -> None:
         rest, state = self._limits.rest, self.state
-        if rest is None or math.isnan(evidence.rest):
+        if rest is None:
+            return
+        if math.isnan(evidence.rest):
+            if self._watches_jumps:
+                known_min = min(state.rest_min, rest.after_min)
+                state.rest_min = max(known_min - _REST_UNKNOWN * self._period_min, 0.0)
             return
         state.rest_min = state.rest_min + self._period_min if evidence.rest <= rest.at_most else 0.0
         if state.rest_min < rest.after_min or math.isnan(evidence.apart_k):
@@ -342,7 +351,7 @@ class PlausibilityCheck:
     def _end_exchange(self) -> None:
         """Believe that sensors are no longer exchanged once measured Y agrees with what they say of a warm machine."""
         state = self.state
-        if not (state.exchanged and self._ends_exchange and state.below_min == 0.0):
+        if not (state.exchanged and self._watches_jumps and state.below_min == 0.0):
             return
         last = state.blocks[-_RIGHT_BLOCKS:]
         if len(last) == _RIGHT_BLOCKS and all(
