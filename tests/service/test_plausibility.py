@@ -281,6 +281,21 @@ def test_exchanged_at_the_start_is_seen_once_heat_has_come_and_latched(day: dict
     assert largest_step(outcomes) <= 8.0 + 1e-9
 
 
+@pytest.mark.parametrize(("stop", "after"), [(720, 15), (2, 7)])
+def test_minutes_below_at_are_not_added_up_over_a_night(stop: int, after: int) -> None:
+    """T_Q is below AT for 10 of 15 min, the service is stopped, and it is below AT again; a stop costs its time."""
+    compensation = Compensation(checked(), QUILL)
+    values = {"t_q_degc": 20.0, "at_degc": 20.0, "y_um": math.nan, "heat_w": 0.0}
+    compensation.process(sample(0, values))
+    outcomes = []
+    for i in range(1, 11):
+        compensation.process(sample(i, values | {"at_degc": 23.0 + 0.01 * i}))
+    compensation.pause(stop)
+    for i in range(20):
+        outcomes.append(compensation.process(sample(11 + stop + i, values | {"at_degc": 23.0 - 0.01 * i})))
+    assert first_at(outcomes, "t_q_at_exchanged") == after - 1
+
+
 @pytest.mark.parametrize("has_y", [True, False])
 def test_measured_y_ends_an_exchange_that_is_over(day: dict[str, np.ndarray], has_y: bool) -> None:
     """It began unnoticed, on the cold machine; without Y, and while the wires are not right, a person has to say so."""
