@@ -335,6 +335,29 @@ def test_a_pause_is_no_sample_of_a_return(day: dict[str, np.ndarray]) -> None:
     assert events(outcomes, "accepted") == [END + 4]
 
 
+@pytest.mark.parametrize("size", [-5.0, 6.0])
+def test_resume_after_a_stop_in_which_a_channel_was_mended_is_right_at_once(
+    day: dict[str, np.ndarray], size: float
+) -> None:
+    """Nobody saw it return, so it is held without: only a person knows that it was mended."""
+    compensation, outcomes = Compensation(settings(), QUILL), []
+    stopped = range(330, 360)
+    for i in range(450):
+        if i in stopped:
+            continue
+        if i == stopped.stop:
+            compensation.pause(len(stopped))
+        if i == stopped.stop + 60:
+            compensation.resume()
+        values = readings(day, i) | {"y_um": math.nan}
+        values["t_q_degc"] += size if BEGIN <= i < stopped.start else 0.0
+        outcomes.append(compensation.process(sample(i, values)))
+    asked = stopped.stop + 60 - len(stopped)
+    assert {o.offset.state for o in outcomes[stopped.start : asked]} == {"hold"}
+    wrong_um = np.abs(offsets(outcomes)[asked + 5 :] - undisturbed()[stopped.stop + 65 : 450])
+    assert np.max(wrong_um) < 5.0 and outcomes[-1].offset.state == "ok"
+
+
 @pytest.mark.parametrize("size", [8.0, -8.0])
 def test_a_jump_that_takes_three_samples_is_one_jump(day: dict[str, np.ndarray], size: float) -> None:
     """Each step is within the permitted rate; less the first step alone, the rest would be heat."""

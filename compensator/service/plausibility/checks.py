@@ -38,7 +38,7 @@ from compensator.service.plausibility.isolation import LEAST_SHARE, LOG_ODDS, Fa
 BLOCK_SAMPLES = 10
 #: Fraction of a block that must be usable.
 _USABLE = 0.5
-#: Number of blocks used for fault isolation: 12 h of one-minute samples.
+#: Number of blocks used for fault isolation, 720 samples.
 WINDOW = 72
 #: Shift, in standard deviations of the residual, that the CUSUM is designed for.
 _SHIFT = 5.0

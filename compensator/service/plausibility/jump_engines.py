@@ -35,7 +35,7 @@ UNSEEN_SAMPLES = 2
 BRIDGED_SAMPLES = 480
 #: Deviations at which one sample's evidence is clipped: a switched heat is not evidence against a sensor.
 _CLIP = 5.0
-#: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
+#: Weight of the past in the log likelihood ratio of a suspect channel, by sample: it counts about 30 samples.
 _KEEP = 1.0 - 1.0 / 30.0
 #: Deviations from which on a heat outside of the range of validity cannot be.
 _BEYOND = 2.0
