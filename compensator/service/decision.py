@@ -150,7 +150,7 @@ class OffsetDecision:
         has_zero: bool,
         memory: Memory,
         plausibility: PlausibilityCheck,
-        jumps: JumpWatch | None,
+        jumps: JumpWatch,
     ) -> Condition:
         """Return what a sample means for every axis; called once for each sample.
 
@@ -164,15 +164,14 @@ class OffsetDecision:
             Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
             Checks between the sensors, including this sample.
-        jumps : JumpWatch, optional
+        jumps : JumpWatch
             Channels that have jumped, and those that may have.
         """
         pairs = ((Reason.T_Q_MISSING, values.t_q), (Reason.AT_MISSING, values.at))
         reasons: list[str] = [reason for reason, value in pairs if math.isnan(value)]
         lost = bool(reasons)
-        if jumps is not None:
-            reasons += [f"{Reason.SUSPECT_CHANNEL}:{name}" for name in jumps.suspects]
-            reasons += [f"{Reason.UNCONFIRMED_CHANNEL}:{name}" for name in jumps.unconfirmed]
+        reasons += [f"{Reason.SUSPECT_CHANNEL}:{name}" for name in jumps.suspects]
+        reasons += [f"{Reason.UNCONFIRMED_CHANNEL}:{name}" for name in jumps.unconfirmed]
         memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
         expired = lost and memory.missing_min > self._predict_for_min
         later: list[str] = []

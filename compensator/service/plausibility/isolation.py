@@ -128,7 +128,7 @@ class FaultIsolation:
         energy, count = _energy(z, self._keep)
         if energy > 0.0:
             ranked = [dataclasses.replace(fit, share=fit.gain / energy) for fit in ranked]
-        left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
+        left = 2.0 * (energy - ranked[0].gain)
         return ranked, count > 0 and left > MISFIT * count
 
     def _as_prediction(self, blocks: Sequence[ResidualBlock], whitened: Sequence[_Whitened]) -> FaultFit:
