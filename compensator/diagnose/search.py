@@ -38,8 +38,9 @@ ALIAS_FREE = 3.0
 SMALLER = (1.5, 6.0)
 #: Where the base leaves no more than it may by its own error, an input must add so much more to the evidence.
 EXPECTED = 8.0
-#: One explanation foretells clearly better than another if it leaves so much of its error on held-out blocks.
-FORETELLS = 0.8
+#: Explanations are about as likely if they differ by so little, and one foretells clearly better than another if it
+#: leaves so much of its error on held-out blocks.
+NEARLY, FORETELLS = 2.0, 0.8
 #: Kinds of what may change in a path that stays linear.
 OF_PATHS = ("dynamics", "gain", "delay")
 
@@ -343,8 +344,8 @@ class Search:
     def _foretelling(self, fit: Fit, *, apart_from: frozenset[Place]) -> Fit:
         """Exchange an effect, or its form, for one that is as likely, or nearly, and foretells clearly better.
 
-        Where explanations differ by less than the price of an effect, the evidence does not choose; a form of many lags
-        is as likely as one lag then, and elsewhere it runs free.
+        There the evidence does not choose; a form of many lags is as likely as one lag then, and elsewhere it runs
+        free. What is more likely is kept: a block that is held out may have the one event that shows it.
         """
         if self.evidence.is_sparse or self.evidence.free_paths or self.points.is_exact:
             return fit
@@ -354,7 +355,7 @@ class Search:
                 continue
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from | others.places)
-            least = self.criterion.score(fit) - self.criterion.price
+            least = self.criterion.score(fit) - NEARLY
             settled_ones = [settled(one) for one in proposed[:FITTED] if one.forms != fit.forms]
             near = [one for one in settled_ones if self.criterion.score(one) > least]
             if near:

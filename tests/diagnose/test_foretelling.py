@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from compensator.diagnose import search as search_module
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, rest_without_effects
@@ -30,7 +31,7 @@ def test_of_explanations_that_are_about_as_likely_the_one_that_foretells_is_take
     searched = search("input", 3, 5.0)
     channel = draw("input", 3, 5.0).place[2]
     wrong = alone(searched, "(square)", channel)
-    monkeypatch.setattr(type(searched.criterion), "price", 1e9)  # any two are about as likely
+    monkeypatch.setattr(search_module, "NEARLY", 1e9)  # any two are about as likely
     chosen = searched._foretelling(wrong, apart_from=frozenset())
     folds = Folds(searched.points)
     assert folds.error_um(chosen) < FORETELLS * folds.error_um(wrong)
