@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,10 +32,16 @@ class Folds:
         self._parts = [(block, points.of(points.evidence.without(block))) for block in points.evidence.blocks(FOLDS)]
 
     def error_um(self, fit: Fit) -> float:
-        """Return what the effects of a fit, fitted without each block, leave of it, µm rms; not chosen anew."""
+        """Return what the effects of a fit, fitted without each block, leave of it, µm rms; not chosen anew.
+
+        Infinite where the others do not determine them.
+        """
         left = []
         for block, points in self._parts:
-            own = settled(fit_terms(Likelihood(points, fit.rest), fit.starts()))
+            try:
+                own = settled(fit_terms(Likelihood(points, fit.rest), fit.starts()))
+            except np.linalg.LinAlgError:  # without the block nothing shows how large they are
+                return math.inf
             predicted = Nuisances(points, own.rest).beside(summed(points.evidence, own.terms))
             left.append(left_of_block(self._evidence, block, zeros_known(points), predicted))
         return rms_of(np.concatenate(left))

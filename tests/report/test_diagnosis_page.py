@@ -19,8 +19,9 @@ from compensator.data.measurement import read
 from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.advice import Advice, Unexplained
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Refused, Remainder, Step
+from compensator.diagnose.outcome import Ceiling, Diagnosis, Refused, Remainder, Step
 from compensator.diagnose.points import Points
+from compensator.diagnose.prediction import FOLDS
 from compensator.diagnose.summary import contents, error_table, figures, headline, name, verdict
 from compensator.display import text_of_all
 from compensator.model.model_file import load_model

@@ -281,10 +281,10 @@ def again(compensation: Compensation) -> Compensation:
 def test_what_probes_during_a_hold_have_shown_reaches_other_models(day: dict[str, np.ndarray]) -> None:
     """In shadow, and without the probes as `adopt` warms up; T_Q is doubted there, too, and right."""
     hourly = {30: 0.0, 90: 0.0, 150: 0.0, 210: 0.0}
-    outcomes = probed_day(day, hourly, rate_max=0.5)
+    outcomes = probed_day(day, hourly, rate_max=0.5, least_k=0.5)
     probe = Probe(std_um=1.0, measured_max_um=200.0, largest_um=40.0, tolerance_um=3.0)
     channels = [c | {"rate_max_per_min": 0.5} if c["name"] == "t_q_degc" else c for c in CHANNELS]
-    conf = msgspec.structs.replace(settings(channel=channels), probe=probe)
+    conf = msgspec.structs.replace(settings(channel=channels, jump_min_k=0.5), probe=probe)
     shadow, warmed = (Shadow(Compensation(conf, QUILL), b"") for _ in range(2))
     followed = []
     for outcome in outcomes:

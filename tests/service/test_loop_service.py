@@ -520,7 +520,7 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
 ) -> None:
     machine, works, refused = Looping(tmp_path, shown(extended())), model_store.replace_file, list[Path]()
 
-    def full(path: Path, data: bytes) -> None:
+    def full(path: Path, data: bytes, **_: object) -> None:
         refused.append(path)
         raise OSError(errno.ENOSPC, "No space left on device")
 

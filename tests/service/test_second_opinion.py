@@ -252,7 +252,7 @@ async def test_temperatures_that_measured_y_has_shown_to_be_right_keep_no_model_
     guarded = settings(plausibility=checks, guards={"t_q_below_at_max_k": 2.0, "suspect_jumps": True})
     machine = Measured(tmp_path, config=guarded)
     t_q = machine.device.sources[0]
-    fallen_k = functools.partial(np.interp, xp=[400, 460, 600, 660], fp=[0.0, 40.0, 40.0, 0.0])
+    fallen_k = functools.partial(np.interp, xp=[400, 460, 600, 660], fp=[0.0, 20.0, 20.0, 0.0])
     machine.device.sources[0] = lambda: t_q() - float(fallen_k(len(machine.outcomes)))
     await machine.run(1300)
     waits = ["t_q_at_exchanged" in outcome.offset.reasons for outcome in machine.outcomes]
