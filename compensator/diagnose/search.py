@@ -356,8 +356,13 @@ class Search:
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from | others.places)
             least = self.criterion.score(fit) - NEARLY
-            settled_ones = [settled(one) for one in proposed[:FITTED] if one.forms != fit.forms]
-            near = [one for one in settled_ones if self.criterion.score(one) > least]
+            # A form of any lags does not take the place of one with a law: it may resemble that.
+            others_settled = [
+                settled(one)
+                for one in proposed[:FITTED]
+                if one.forms != fit.forms and (term.effect.has_any_form or not one.terms[-1].effect.has_any_form)
+            ]
+            near = [one for one in others_settled if self.criterion.score(one) > least]
             if near:
                 errors = [folds.error_um(one) for one in near]
                 best = int(np.argmin(errors))

@@ -47,6 +47,9 @@ def test_what_is_clearly_more_likely_is_kept_whatever_blocks_say(monkeypatch):
     )
     chosen = searched._foretelling(right, apart_from=frozenset())
     assert [term.hypothesis.place for term in chosen.terms] == [term.hypothesis.place for term in right.terms]
+    monkeypatch.setattr(search_module, "NEARLY", 1e9)
+    (any_other,) = searched._foretelling(right, apart_from=frozenset()).terms
+    assert not any_other.effect.has_any_form
 
 
 @pytest.mark.parametrize(("kind", "size_um", "is_named"), [("input", 2.0, True), ("none", 0.0, False)])
