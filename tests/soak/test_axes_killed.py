@@ -97,13 +97,13 @@ def test_after_a_kill_every_axis_goes_on_from_where_it_was(tmp_path: Path) -> No
     last = values[final.seq]
 
     # The receiver: all axes together, of a whole sample, and each at most as fast as the service.
-    assert {applied.seq for _, applied in polled} - {None} <= set(values)
+    assert {applied.seq for _, applied in polled} - {None} <= set(heard.whole)
     for (before_s, before), (after_s, after) in itertools.pairwise(polled):
         assert len({(one.state, one.seq) for one in after.axes.values()}) == 1, after.text
         assert "incomplete" not in {reason.code for reason in after.reasons}
         seconds = after_s - before_s + 2.0 * PERIOD_S
         if before.seq is not None and after.seq != before.seq:
-            seconds += values[after.seq]["time_s"] - values[before.seq]["time_s"]  # type: ignore[index]
+            seconds += heard.whole[after.seq]["time_s"] - heard.whole[before.seq]["time_s"]  # type: ignore[index]
         for axis, its in LEVERS.items():
             rate = sum(lever * RATES[name] for name, lever in its.items())
             moved = after.axes[axis].offset_um - before.axes[axis].offset_um
