@@ -235,6 +235,17 @@ stuck_after_min = 6000.0
                 found[seq] = record.data
         return found
 
+    def missing(self) -> list[int]:
+        """Numbers that stand in no recording; of so many samples the service itself says that it stood still."""
+        numbers = self.on_disk()
+        missing = sorted(set(range(min(numbers), max(numbers))) - set(numbers))
+        said = 0
+        for path in recordings(self.recordings, self.name):
+            events = [json.loads(record.data) for record in read_messages(path, ("event",))]
+            said += sum(event["data"]["missing"] for event in events if event["kind"] == "restart")
+        assert len(missing) == said, (missing, said)
+        return missing
+
     def replay(self, public_key: Path | None = None) -> dict[str, Any]:
         """What `compensator replay` says, with its exit code; with a key it knows the head of the chain, too."""
         command = [sys.executable, "-m", "compensator", "replay", str(self.recordings), "--json"]
