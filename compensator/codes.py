@@ -862,9 +862,10 @@ class ProbeSourceRemark(Code):
     )
     LINE_AHEAD = (
         "line_ahead",
-        "A line of a CSV file has a time that this computer's clock has not reached yet; it waits in its file.",
+        "A line of a CSV file has a time that this computer's clock has not reached yet; it is sent once the clock has "
+        "been set forward, and not if that time just passes: then it was the line's clock that was wrong.",
         "Nothing if this computer has just started; else check the time service (NTP) of whoever wrote it and of this "
-        "computer.",
+        "computer, and the time zone of the lines; probe again.",
     )
     LINE_OFFSET_UNKNOWN = (
         "line_offset_unknown",

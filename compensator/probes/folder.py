@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from compensator.clock import duration
+from compensator.clock import Clock, SystemClock, duration
 from compensator.codes import ProbeSourceRemark
 from compensator.errors import UsageError
 from compensator.input_file import read_file
@@ -21,7 +21,7 @@ from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
 LONGEST = 10_000_000
-#: A line whose time is farther ahead of this computer's clock than this waits in its file, ns.
+#: A line farther ahead of this computer's clock than this waits until the clock is set forward by more than this, ns.
 AHEAD_NS = 5_000_000_000
 #: So many lines and files are read before the other sources have their turn.
 READ_AT_ONCE = 200
@@ -33,6 +33,38 @@ class _Signature(NamedTuple):
     inode: int
     size: int
     mtime_ns: int
+
+
+@dataclass(slots=True)
+class _Ahead:
+    """A line that was ahead of the clock here.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Its file.
+    time_utc_ns : int
+        Its time.
+    set_to_ns : int
+        Wall clock less monotonic clock when it was found, or last so far ahead.
+    """
+
+    path: Path
+    time_utc_ns: int
+    set_to_ns: int
+
+    def is_due(self, clock: Clock) -> bool:
+        """Return whether the clock was set since, so that the line was right, and has reached it.
+
+        That time has passed does not make it right: written with a wrong clock, it would be sent as touched just now.
+        """
+        utc_ns = clock.utc_ns()
+        set_to_ns = utc_ns - clock.monotonic_ns()
+        if set_to_ns - self.set_to_ns <= AHEAD_NS:
+            return False
+        if self.time_utc_ns - utc_ns > AHEAD_NS:
+            self.set_to_ns = set_to_ns
+        return self.time_utc_ns <= utc_ns
 
 
 class WatchedFolder:
@@ -54,8 +86,8 @@ class WatchedFolder:
         Returns whether another probe can be submitted now; lines wait in their file until then.
     report : callable
         Called with a line for each line that is not sent.
-    utc_ns : callable, optional
-        Wall clock, ns.
+    clock : Clock, optional
+        That of this computer.
     """
 
     def __init__(
@@ -68,7 +100,7 @@ class WatchedFolder:
         *,
         send_within_s: float,
         has_room: Callable[[], bool] = lambda: True,
-        utc_ns: Callable[[], int] = time.time_ns,
+        clock: Clock | None = None,
     ) -> None:
         self._settings = settings
         self._handled = handled
@@ -77,13 +109,13 @@ class WatchedFolder:
         self._report = report
         self._send_within_ns = round(send_within_s * 1e9)
         self._has_room = has_room
-        self._utc_ns = utc_ns
+        self._clock = clock or SystemClock()
         self._to_read: dict[Path, None] = {}
         self._reading: Iterator[None] = iter(())
         self._seen: dict[Path, _Signature] = {}
         self._read: dict[Path, _Signature] = {}
-        #: Files with lines that are ahead of the clock here, and when the first of them no longer is.
-        self._ahead: dict[Path, int] = {}
+        #: By identity; they count as handled, so that none is sent by another start, which cannot know of the clock.
+        self._ahead: dict[str, _Ahead] = {}
         self._pending: dict[str, str] = {}
         self._reported: set[tuple[Path, str]] = set()
 
@@ -106,9 +138,11 @@ class WatchedFolder:
         """
         self.keep()
         found = dict(self._files())
-        for path in [path for path, due_ns in self._ahead.items() if self._utc_ns() >= due_ns or path not in found]:
-            del self._ahead[path]
-            self._read.pop(path, None)
+        oldest_ns = self._clock.utc_ns() - self._send_within_ns
+        self._ahead = {identity: one for identity, one in self._ahead.items() if one.time_utc_ns >= oldest_ns}
+        for ahead in self._ahead.values():
+            if ahead.is_due(self._clock):
+                self._read.pop(ahead.path, None)
         for path, signature in found.items():
             if self._read.get(path) != signature and self._seen.get(path) == signature:
                 self._read[path] = signature
@@ -137,7 +171,7 @@ class WatchedFolder:
     def keep(self) -> None:
         """Keep on disk which lines were handled."""
         try:
-            self._handled.write(self._utc_ns())
+            self._handled.write(self._clock.utc_ns())
         except (OSError, UsageError) as error:
             self._trouble(Path(self._settings.path), error)
 
@@ -178,14 +212,16 @@ class WatchedFolder:
             self._refuse(path, ProbeSourceRemark.ROW_BROKEN, lines[0], str(bad))
             return
         old = 0
+        ahead = len(self._ahead)
         for line in lines[1:]:
             old += self._handle(path, names, line)
             yield
         if old:
             why = f"{old} line(s) older than {duration(self._send_within_ns / 1e9)}"
             self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
-        if path in self._ahead:
-            self._refuse(path, ProbeSourceRemark.LINE_AHEAD, "", "line(s) ahead of this computer's clock wait")
+        if len(self._ahead) > ahead:
+            why = "line(s) ahead of this computer's clock, not sent before it is set"
+            self._refuse(path, ProbeSourceRemark.LINE_AHEAD, "", why)
 
     def _handle(self, path: Path, names: list[str], text: str) -> bool:
         """Submit a line that is new; return whether it was not because it is too old."""
@@ -201,13 +237,18 @@ class WatchedFolder:
         if before is not None:
             if before != line.values:
                 self._refuse(path, ProbeSourceRemark.LINE_CHANGED, text, "sent before with other values")
-            return False
-        age_ns = self._utc_ns() - line.time_utc_ns
-        if age_ns > self._send_within_ns:
+                return False
+            ahead = self._ahead.get(line.identity)
+            if ahead is None or not ahead.is_due(self._clock):
+                return False
+            del self._ahead[line.identity]
+        utc_ns = self._clock.utc_ns()
+        if utc_ns - line.time_utc_ns > self._send_within_ns:
             return True
-        if age_ns < -AHEAD_NS:
+        if line.time_utc_ns - utc_ns > AHEAD_NS:
             # As until NTP has set the clock here after a boot: the service would refuse the probe for good.
-            self._ahead[path] = min(self._ahead.get(path, line.time_utc_ns), line.time_utc_ns - AHEAD_NS)
+            self._ahead[line.identity] = _Ahead(path, line.time_utc_ns, utc_ns - self._clock.monotonic_ns())
+            self._handled.add(line)
             return False
         offset_um = line.offset_applied_um
         if offset_um is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,7 @@ log = logging.getLogger("compensator")
 _MARGIN_S = 86400.0
 
 
-async def serve(
-    settings: ProbeSettings,
-    sink: ProbeSink,
-    stop: asyncio.Event,
-    *,
-    report: Report = log.info,
-    utc_ns: Callable[[], int] = time.time_ns,
-) -> None:
+async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *, report: Report = log.info) -> None:
     """Read all sources and send what they yield, until `stop` is set.
 
     Parameters
@@ -45,8 +37,6 @@ async def serve(
         Ends it.
     report : callable, optional
         Called with a line for each probe and each line that is no probe; the log by default.
-    utc_ns : callable, optional
-        Wall clock, ns.
 
     Raises
     ------
@@ -54,7 +44,7 @@ async def serve(
         If the state file cannot be read.
     """
     service = settings.service
-    sender = Sender(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=report, utc_ns=utc_ns)
+    sender = Sender(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=report)
 
     def applied(time_utc_ns: int) -> float | None:
         return applied_at(Path(service.applied_file), time_utc_ns) if service.applied_file else None
@@ -76,16 +66,15 @@ async def serve(
                 report,
                 send_within_s=within_s,
                 has_room=sender.has_room,
-                utc_ns=utc_ns,
             )
             watching.append(watched)
             runs.append(watched.run(stop))
     runs.append(sender.run(stop))
     for dprnt in settings.dprnt:
         printed = PrintedProbes(dprnt, submitting(dprnt.name), applied, report)
-        runs.append(Stream(dprnt, printed, report, utc_ns=utc_ns).run(stop))
+        runs.append(Stream(dprnt, printed, report).run(stop))
     for linuxcnc in settings.linuxcnc:
-        file = ProbeFile(linuxcnc, submitting(Path(linuxcnc.file).name), applied, report, utc_ns=utc_ns)
+        file = ProbeFile(linuxcnc, submitting(Path(linuxcnc.file).name), applied, report)
         runs.append(file.run(stop))
     async with asyncio.TaskGroup() as group:
         for run in runs:

@@ -43,7 +43,7 @@ class Bench:
         self.reports: list[str] = []
         self.waiting: list[Callable[[Outcome], None]] = []
         self.answers = True
-        self.minute = 2.0
+        self.minute, self.set_by_min = 2.0, 0.0  # of the wall clock, and by how much it was set
         self.applied_um = applied_um
         self.sign, self.includes_offset, self.pattern = 1, False, "*.csv"
         self.restart()
@@ -62,8 +62,16 @@ class Bench:
             lambda _: self.applied_um,
             self.reports.append,
             send_within_s=900.0,
-            utc_ns=lambda: T0_NS + round(self.minute * 60e9),
+            clock=Mock(utc_ns=lambda: T0_NS + self._ns(), monotonic_ns=lambda: self._ns(-self.set_by_min)),
         )
+
+    def set_clock(self, minute: float) -> None:
+        self.set_by_min += minute - self.minute
+        self.minute = minute
+        self.look()
+
+    def _ns(self, since_min: float = 0.0) -> int:
+        return round((self.minute + since_min) * 60e9)
 
     def _submit(self, probe: Probe, source: str, done: Callable[[Outcome], None]) -> None:
         assert source.endswith(".csv")
@@ -107,17 +115,33 @@ def test_a_line_ahead_of_the_clock_waits_until_the_clock_is_set(tmp_path: Path) 
     """The service would refuse it as of the future, and what was handled is not sent again."""
     bench = Bench(tmp_path)
     bench.minute = -30.0
-    bench.write(HEADER + line(1.0) + line(1.5) + line(300.0))
+    bench.write(HEADER + line(1.0) + line(1.5) + line(2.05) + line(300.0))
+    assert not bench.probes and ["[line_ahead]" in report for report in bench.reports] == [True]
+    bench.set_clock(2.0)
+    bench.look()
+    assert bench.minutes == [1.0, 1.5] and len(bench.reports) == 1
+    bench.minute = 2.06  # what is a little ahead of the clock that was set is sent when its time comes
+    bench.look()
+    assert bench.minutes == [1.0, 1.5, 2.05]
+    bench.minute = 300.5  # and what is far ahead of it, never
+    bench.look()
+    bench.write(HEADER + line(1.0) + line(300.0) + line(300.2))
+    assert bench.minutes == [1.0, 1.5, 2.05, 300.2]
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_line_with_a_wrong_clock_is_not_sent_because_its_time_has_passed(tmp_path: Path, restarted: bool) -> None:
+    """It would be a touch of two hours ago that counts as one of now."""
+    bench = Bench(tmp_path)
+    bench.write(HEADER + line(122.0))
+    assert "[line_ahead]" in bench.reports[0]
+    if restarted:
+        bench.restart()
+    bench.minute = 122.5
+    bench.write(HEADER + line(122.0) + line(122.2))
     bench.restart()
     bench.look()
-    assert not bench.probes and ["[line_ahead]" in report for report in bench.reports] == [True, True]
-    bench.minute = 2.0
-    bench.look()
-    bench.look()
-    assert bench.minutes == [1.0, 1.5] and len(bench.reports) == 2
-    bench.minute = 300.0
-    bench.look()
-    assert bench.minutes == [1.0, 1.5, 300.0]
+    assert bench.minutes == [122.2] and len(bench.reports) == 1
 
 
 def test_a_file_whose_lines_wait_is_not_read_before_they_are_due(
