@@ -581,7 +581,8 @@ class DataRemark(Code):
     )
     TEMPERATURE_MISSING = (
         "temperature_missing",
-        "T_Q or AT is missing for too long to interpolate; the record is split there, as where rows are missing.",
+        "T_Q or AT is missing for too long to interpolate; the record is split there, as where rows are missing. For a "
+        "diagnosis it goes on as long as Y is measured: about one zero, from a state that is not known.",
         "Check the sensor and the logger.",
     )
     TEMPERATURE_SPARSE = (

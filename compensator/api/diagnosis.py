@@ -448,7 +448,7 @@ def _diagnose_axis(
     screened = partial(
         screened_runs_in, period_s=base.period_s, y_std_um=y_std_um, check=partial(require_channels, base)
     )
-    runs, remarks = screened(measured, every_zero=True)
+    runs, remarks = screened(measured, whole_y=True)
     remarks += _several_zeros(runs)
     require_y_noise(name_of(runs), runs)
     for one in validation:  # refused before the search, which may take minutes

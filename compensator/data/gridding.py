@@ -10,7 +10,8 @@ import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
 from compensator.codes import DataRemark, Remark
-from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
+from compensator.data.record import SHORT_GAP_SAMPLES, TEMPERATURES, SampledData, SampledRecord
+from compensator.data.runs import is_sparse
 from compensator.data.table import DATA_ROLES, Table
 from compensator.errors import DataError
 
@@ -31,18 +32,17 @@ _MEASURED = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 999999.0, 32767.0, 3276.7, 6
 _TEMPERATURE, _APART = (850.0, 1370.0, 1372.0, 1768.0, -200.0, -242.0, -270.0), 3.0
 #: Number of stretches that a remark lists.
 _SHOWN = 3
-#: Temperatures that no model runs without.
-_INPUTS = ("t_q_degc", "at_degc")
 #: Share of a sample's period from which rows apart are one for each sample, and not several.
 _ROW_OF_SAMPLE = 0.75
 #: Share of rows without a temperature, outside long gaps, from which it is remarked on.
 _SPARSE = 0.1
 
 
-def to_grid(table: Table, period_s: float) -> SampledData:
+def to_grid(table: Table, period_s: float, *, whole_y: bool = False) -> SampledData:
     """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
 
-    Rows without T_Q or AT are a gap like rows that are missing: the model knows nothing there.
+    Rows without T_Q or AT are a gap like rows that are missing: the model knows nothing there. With `whole_y` they are
+    none as long as Y is measured.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         As it was read.
     period_s : float
         Sample period of the model, s.
+    whole_y : bool
+        Whether a record goes on where T_Q or AT is missing for long and Y is measured: about one zero.
 
     Raises
     ------
@@ -91,8 +93,12 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     if usual > 0:
         words = f"{table.name}: its rows are {apart_s:.0f} s apart, samples {period_s:g} s; bridged."
         remarks.append(Remark(DataRemark.ROWS_APART, words))
-    empty = {name: present & np.isnan(columns[name]) for name in _INPUTS if name in columns}
-    records = _between_long_gaps(present & ~np.any([*empty.values()], axis=0)) if empty else []
+    empty = {name: present & np.isnan(columns[name]) for name in TEMPERATURES if name in columns}
+    known = present & ~np.any([*empty.values()], axis=0) if empty else present
+    if whole_y and known.any() and "y_um" in columns:
+        y_um, at = columns["y_um"], np.flatnonzero(known)
+        known[at[0] : at[-1]] |= (present if is_sparse(y_um) else np.isfinite(y_um))[at[0] : at[-1]]
+    records = _between_long_gaps(known) if empty else []
     # Where no sample has both, what is missing is said by who needs it.
     records = records or _between_long_gaps(present)
     inside = np.zeros(n, dtype=bool)
@@ -104,7 +110,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         if not any(mask[first:last].all() for mask in empty.values()):
             gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
             remarks.append(Remark(DataRemark.GAP_SPLITS, f"{gap}; the record is split there."))
-    remarks += _missing_inputs(table.name, empty, period_s)
+    remarks += _missing_inputs(table.name, empty, inside, period_s)
     remarks += (sparse := list(_sparse_inputs(table, slot, order, columns)))
     if not sparse:
         remarks += _short_holes(table.name, {name: mask & inside for name, mask in empty.items()}, period_s)
@@ -144,13 +150,21 @@ def _between_long_gaps(known: Mask) -> list[tuple[int, int]]:
 
 def _short_holes(name: str, empty: Mapping[str, Mask], period_s: float) -> Iterator[Remark]:
     """Yield one remark on all temperatures that are empty in samples of the records."""
-    holes = {column: np.flatnonzero(mask) for column, mask in empty.items()}
+    holes = {column: np.flatnonzero(mask & ~_long(mask)) for column, mask in empty.items()}
     said = [f"{c} in {at.size} sample(s), first at t_s = {at[0] * period_s:g}" for c, at in holes.items() if at.size]
     if said:
         yield Remark(DataRemark.GAP_BRIDGED, f"{name}: empty: {'; '.join(said)}; bridged between known ones.")
 
 
-def _missing_inputs(name: str, empty: Mapping[str, Mask], period_s: float) -> Iterator[Remark]:
+def _long(mask: Mask) -> Mask:
+    """Return the samples of a mask that are in stretches longer than what is bridged."""
+    long = np.zeros(mask.size, dtype=bool)
+    for first, last in _gaps(~mask):
+        long[first:last] = last - first > SHORT_GAP_SAMPLES
+    return long
+
+
+def _missing_inputs(name: str, empty: Mapping[str, Mask], inside: Mask, period_s: float) -> Iterator[Remark]:
     """Yield a remark on each temperature that is missing for longer than what is bridged."""
     for column, mask in empty.items():
         long = [(first, last) for first, last in _gaps(~mask) if last - first > SHORT_GAP_SAMPLES]
@@ -158,9 +172,13 @@ def _missing_inputs(name: str, empty: Mapping[str, Mask], period_s: float) -> It
             hours = sum(last - first for first, last in long) * period_s / 3600.0
             where = ", ".join(f"{first * period_s:g}" for first, _ in long[:_SHOWN])
             more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
-            words = (
-                f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; the record is split there."
+            splits = not all(inside[first] for first, _ in long)
+            what = (
+                "the record is split there"
+                if splits
+                else "Y is left out there, and the machine's state after it is unknown"
             )
+            words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; {what}."
             yield Remark(DataRemark.TEMPERATURE_MISSING, words)
 
 
@@ -187,11 +205,8 @@ def _check_clock(table: Table, period_s: float) -> None:
 
 def _sparse_inputs(table: Table, slot: Indices, order: Indices, columns: Mapping[str, Vector]) -> Iterator[Remark]:
     """Yield a remark on each temperature that is missing in many rows, long gaps apart."""
-    for column in [c for c in _INPUTS if c in columns]:
-        in_long_gap = np.zeros(columns[column].size, dtype=bool)
-        for first, last in _gaps(~np.isnan(columns[column])):
-            in_long_gap[first:last] = last - first > SHORT_GAP_SAMPLES
-        empty = np.isnan(table.columns[column][order])[~in_long_gap[slot]]
+    for column in [c for c in TEMPERATURES if c in columns]:
+        empty = np.isnan(table.columns[column][order])[~_long(np.isnan(columns[column]))[slot]]
         if empty.size and np.mean(empty) > _SPARSE:
             words = f"{table.name}: {column} is empty in {100.0 * np.mean(empty):.0f} % of the rows."
             yield Remark(DataRemark.TEMPERATURE_SPARSE, words)

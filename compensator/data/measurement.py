@@ -113,23 +113,24 @@ class Measurement(display.Shown):
         """Time from the first row to the last, h."""
         return float(np.ptp(self.table.t_s)) / 3600.0
 
-    def at_period(self, period_s: float, *, every_zero: bool = False) -> SampledData:
+    def at_period(self, period_s: float, *, whole_y: bool = False) -> SampledData:
         """Return the records at a sample period, s, with what had to be corrected.
 
         Parameters
         ----------
         period_s : float
             Sample period, s.
-        every_zero : bool
-            Whether Y that was probed is that about every zero, and not only about that which has most probes.
+        whole_y : bool
+            Whether all of Y is kept: what was probed about every zero, and not only about that which has most probes,
+            and what was measured before and after T_Q or AT was missing for long, in one record.
 
         Raises
         ------
         DataError
             If a value or time cannot have been measured.
         """
-        table, others = (self.table, ()) if every_zero else of_one_zero(self.table)
-        data = to_grid(table, period_s)
+        table, others = (self.table, ()) if whole_y else of_one_zero(self.table)
+        data = to_grid(table, period_s, whole_y=whole_y)
         records, left_out = cleaned(self.name, data.records)
         return SampledData(records=records, remarks=(*self.remarks, *others, *data.remarks, *left_out))
 
@@ -340,7 +341,7 @@ def runs_in(
     *,
     y_std_um: float | None = None,
     check: Callable[[SampledRecord, str], None] = lambda record, name: None,
-    every_zero: bool = False,
+    whole_y: bool = False,
 ) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements, and what had to be corrected.
 
@@ -354,8 +355,9 @@ def runs_in(
         Standard deviation of one measured value of Y, µm; by default what neighbouring values show.
     check : callable
         Called with each record and the name of its data; refuses what cannot be used.
-    every_zero : bool
-        Whether Y that was probed is that about every zero (`Run.zeros_s`), and not only about one.
+    whole_y : bool
+        Whether all of Y is kept: what was probed about every zero (`Run.zeros_s`), and not only about one, and what was
+        measured before and after T_Q or AT was missing for long (`Run.holes`), in one run.
 
     Raises
     ------
@@ -365,7 +367,7 @@ def runs_in(
         If the standard deviation is none.
     """
     check_y_std(y_std_um)
-    gridded = [(measured, measured.at_period(period_s, every_zero=every_zero)) for measured in data]
+    gridded = [(measured, measured.at_period(period_s, whole_y=whole_y)) for measured in data]
     runs: list[Run] = []
     remarks: list[Remark] = []
     for number, (measured, part) in enumerate(gridded):
@@ -375,9 +377,9 @@ def runs_in(
             require(measured.name, record, _NEEDED)
             refuse_at_limit(measured.name, record)
             zeros_s = tuple(at_s - float(measured.table.t_s.min()) for at_s in measured.table.zeros_s)
-            for run in runs_of(measured.label, record):
+            for run in runs_of(measured.label, record, whole_y=whole_y):
                 own = dataclasses.replace(run, recording=number, y_std_um=y_std_um)
-                runs.append(own.with_zeros(zeros_s) if every_zero else own)
+                runs.append(own.with_zeros(zeros_s) if whole_y else own)
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
     return runs, remarks
@@ -389,7 +391,7 @@ def screened_runs_in(
     *,
     y_std_um: float | None = None,
     check: Callable[[SampledRecord, str], None] = lambda record, name: None,
-    every_zero: bool = False,
+    whole_y: bool = False,
 ) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements that a model is judged by, as `runs_in`, with temperatures and Y screened.
 
@@ -398,7 +400,7 @@ def screened_runs_in(
     DataError
         If a temperature cannot be true, or Y moves by no or another unit's amount.
     """
-    runs, remarks = runs_in(data, period_s, y_std_um=y_std_um, check=check, every_zero=every_zero)
+    runs, remarks = runs_in(data, period_s, y_std_um=y_std_um, check=check, whole_y=whole_y)
     name = name_of(runs)
     screen_temperatures(name, runs, quiet_air=True)
     check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))

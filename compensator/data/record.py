@@ -10,6 +10,8 @@ from compensator.arrays import Vector
 from compensator.codes import Remark
 from compensator.errors import DataError
 
+#: Temperatures that no model runs without.
+TEMPERATURES = ("t_q_degc", "at_degc")
 #: A gap of up to this many model samples stays inside a record; the engine bridges it.
 SHORT_GAP_SAMPLES = 60
 

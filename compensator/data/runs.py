@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Indices, Mask, Vector
-from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
+from compensator.data.record import SHORT_GAP_SAMPLES, TEMPERATURES, SampledRecord
 
 #: Longest stretch at the start of a run whose mean is its reference, samples.
 REST_SAMPLES = 30
@@ -130,7 +130,7 @@ class Run:
         return np.asarray(self.ambient_k + self.reference[1])
 
 
-def runs_of(name: str, record: SampledRecord) -> Iterator[Run]:
+def runs_of(name: str, record: SampledRecord, *, whole_y: bool = False) -> Iterator[Run]:
     """Yield the runs of a record.
 
     Parameters
@@ -139,17 +139,23 @@ def runs_of(name: str, record: SampledRecord) -> Iterator[Run]:
         Name for messages.
     record : SampledRecord
         Needs `t_q_degc`, `at_degc`, `y_um`; `heat_w` where it is known.
+    whole_y : bool
+        Whether T_Q or AT that is missing for long is a hole of the one run (`Run.holes`), in place of its end.
     """
     columns = record.columns
-    inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
+    inputs = [*TEMPERATURES, *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)
-    parts = list(_stretches(missing))
+    longest = missing.size if whole_y else SHORT_GAP_SAMPLES
+    parts = list(_stretches(missing, longest))
     for i, (first, last) in enumerate(parts, start=1):
         part = {c: v[first:last] for c, v in columns.items()}
-        bridged = {c: v if c == "y_um" else _bridged(v) for c, v in part.items()}
+        bridged = {
+            c: v if c == "y_um" else _bridged(v, longest if c in TEMPERATURES else SHORT_GAP_SAMPLES)
+            for c, v in part.items()
+        }
         label = name if len(parts) == 1 else f"{name} part {i}"
         run = _run(label, record.t_s[first:last], bridged)
-        holes = [hole for column in ("t_q_degc", "at_degc") for hole in _holes(np.isnan(part[column]))]
+        holes = [hole for column in TEMPERATURES for hole in _holes(np.isnan(part[column]))]
         yield dataclasses.replace(run, row_s=record.row_s, holes=tuple(sorted(set(holes))))
 
 
@@ -166,7 +172,7 @@ def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
         y_um=columns["y_um"] if "y_um" in columns else np.full(t_s.size, np.nan),
         heat_w=heat,
         reference=reference,
-        channels={c: v for c, v in columns.items() if c not in ("t_q_degc", "at_degc", "y_um", "heat_w")},
+        channels={c: v for c, v in columns.items() if c not in (*TEMPERATURES, "y_um", "heat_w")},
     )
 
 
@@ -185,12 +191,12 @@ def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
     return max(1, int(np.argmax(moved)) if moved.any() else size)
 
 
-def _stretches(missing: Mask) -> Iterator[tuple[int, int]]:
-    """Yield the stretches between long gaps, without missing ends."""
+def _stretches(missing: Mask, longest: int) -> Iterator[tuple[int, int]]:
+    """Yield the stretches between gaps of more than so many samples, without missing ends."""
     present = np.flatnonzero(~missing)
     if present.size == 0:
         return
-    breaks = np.flatnonzero(np.diff(present) > SHORT_GAP_SAMPLES + 1)
+    breaks = np.flatnonzero(np.diff(present) > longest + 1)
     for group in np.split(present, breaks + 1):
         if group.size >= SHORTEST_RUN:
             yield int(group[0]), int(group[-1]) + 1
@@ -204,8 +210,8 @@ def _holes(missing: Mask) -> Iterator[tuple[int, int]]:
         yield int(present[i]) + 1, int(present[i + 1])
 
 
-def _bridged(values: Vector) -> Vector:
-    """Return values without short gaps; what a longer one hides is not known."""
+def _bridged(values: Vector, longest: int) -> Vector:
+    """Return values without gaps of up to so many samples; what a longer one hides is not known."""
     known = np.flatnonzero(~np.isnan(values))
     if known.size in (0, values.size):
         return values
@@ -214,7 +220,7 @@ def _bridged(values: Vector) -> Vector:
     before, after = (np.searchsorted(known, at, side=side) for side in ("right", "left"))
     ends = np.concatenate([[-1], known, [values.size]])
     # From the value before a sample, or the begin, to the value after it, or the end.
-    bridged[ends[after + 1] - ends[before] > SHORT_GAP_SAMPLES + 1] = np.nan
+    bridged[ends[after + 1] - ends[before] > longest + 1] = np.nan
     return bridged
 
 

@@ -99,7 +99,7 @@ async def test_probes_about_each_zero_are_told_apart_as_in_the_loop(tmp_path: Pa
     assert np.isfinite(record.columns["y_um"]).sum() == len(level)
     (remark,) = (remark for remark in data.remarks if remark.code == "zeros_left_out")
     assert f"{len(level)} probe(s); {len(taken) - len(level)} about others left out" in remark
-    (run,), remarks = runs_in([found], every_zero=True)
+    (run,), remarks = runs_in([found], whole_y=True)
     assert "zeros_left_out" not in [remark.code for remark in remarks]
     numbers = run.zero_numbers[np.isfinite(run.y_um)].tolist()
     assert numbers == [int(probe.time_utc_ns > zero_ns) for probe in taken]

@@ -23,7 +23,7 @@ def found_in(why):
     return [(effect.kind, effect.path, effect.channel) for effect in why.effects]
 
 
-@pytest.mark.parametrize(("first", "minutes"), [(1500, 30), (480, 45)])
+@pytest.mark.parametrize(("first", "minutes"), [(1500, 30), (480, 45), (900, 300)])
 def test_an_unknown_heat_while_t_q_is_missing_is_no_effect(first, minutes):
     """A line between its ends is no course of the heat; what it leaves in Y looked like a step or a hidden source."""
     columns, _, _ = record([draw("none", 1)], 6, HOURS)
@@ -37,6 +37,20 @@ def test_the_effect_beside_such_a_hole_is_found():
     whole, why = (tc.diagnose("quill", frame(columns, **more)) for more in ({}, {"t_q_degc": holes}))
     assert found_in(why) == found_in(whole) == [("gain", "DTF", None)]
     assert why.effects[0].effect.change == pytest.approx(whole.effects[0].effect.change, rel=0.05)
+
+
+def test_y_counts_from_one_zero_before_and_after_t_q_was_missing_for_hours():
+    """As two records, each about its own mean, they showed a slope of each and half of the drift."""
+    columns, _, _ = record([draw("drift", 2, 4.0)], 6, HOURS)
+    why = tc.diagnose("quill", frame(columns, t_q_degc=without(columns["t_q_degc"], 900, 1200)))
+    assert why.verdict == "explained" and found_in(why) == [("drift", None, None)]
+    assert [remark.code for remark in why.remarks] == ["temperature_missing"]
+    assert "t_q_degc is missing for 5.0 h from t_s = 54000; Y is left out there" in why.remarks[0]
+    # Without Y in between nobody knows whether it still counts from the same zero.
+    beside = tc.diagnose(
+        "quill", frame(columns, **{name: without(columns[name], 900, 1200) for name in ("t_q_degc", "y_um")})
+    )
+    assert "the record is split there" in beside.remarks[0] and beside.diagnosis.evidence.zeros.shape[1] == 2
 
 
 @pytest.mark.parametrize(("first", "last"), [(0, 720), (900, 1500)])
