@@ -486,7 +486,8 @@ def _diagnose_axis(
 
 def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
     """Return a remark on runs in which Y counts from several zeros."""
-    count = sum(1 + len(run.zeros_s) for run in runs if run.zeros_s)
+    zeros = {(run.recording, at_s) for run in runs for at_s in run.zeros_s}
+    count = len(zeros) + len({recording for recording, _ in zeros})
     words = f"{name_of(runs)}: probes about {count} zeros; each has a level of its own in the search."
     return [Remark(DataRemark.SEVERAL_ZEROS, words)] if count else []
 

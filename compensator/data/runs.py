@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +54,8 @@ class Run:
         Where Y was probed: times within it from which on Y counts from another zero, s, each with values on both sides.
     holes : tuple of (int, int)
         First sample and end of each gap of T_Q or AT that was bridged and is longer than usual by more than
-        `HOLE_SAMPLES`: how the machine was heated in it is not known.
+        `HOLE_SAMPLES`: how the machine was heated in it is not known. Also of other channels that a model builds on
+        (`bridging`).
     """
 
     name: str
@@ -105,10 +106,34 @@ class Run:
         zeros = np.sort(zeros_s)
         own = self.without_y(np.any(np.abs(self.t_s - zeros[:, None]) < self.period_s, axis=0))
         numbers = np.searchsorted(zeros, own.t_s)
-        counts = np.bincount(numbers[np.isfinite(own.y_um)], minlength=zeros.size + 1)
+        counts = np.bincount(numbers[np.isfinite(own.y_um) & ~own.in_holes], minlength=zeros.size + 1)
         own = own.without_y(counts[numbers] == 1)
-        # Of zeros without values between them the last one is enough.
+        # Of zeros without values between them the last one is enough. In a hole a value shows nothing.
         return dataclasses.replace(own, zeros_s=tuple(zeros[np.flatnonzero(counts > 1)[1:] - 1].tolist()))
+
+    @property
+    def in_holes(self) -> Mask:
+        """Samples in which the model lacks an input: what it has of Y there says nothing, shape (n,)."""
+        at = np.arange(self.t_s.size)
+        return np.asarray(np.any([(begin <= at) & (at < end) for begin, end in ((0, 0), *self.holes)], axis=0))
+
+    def bridging(self, channels: Collection[str]) -> Run:
+        """Return the run with a hole where one of some channels is missing for long, on which effects of a model build.
+
+        As with T_Q and AT a line takes the place of what is not known.
+        """
+        gaps = {name: missing for name in channels if (missing := np.isnan(self.channels.get(name, 0.0))).any()}
+        if not gaps:
+            return self
+        holes, bridged, at = set(self.holes), dict(self.channels), np.arange(self.t_s.size)
+        for name, missing in gaps.items():
+            values = self.channels[name]
+            known = at[~missing]
+            bridged[name] = np.interp(at, known, values[known]) if known.size else np.zeros(at.size)
+            edges = np.flatnonzero(np.diff(np.concatenate(([0], missing, [0]))))
+            holes |= set(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+        own = dataclasses.replace(self, channels=bridged, holes=tuple(sorted(holes)))
+        return own.with_zeros(own.zeros_s)
 
     @property
     def zero_numbers(self) -> Indices:

@@ -33,7 +33,7 @@ from compensator.diagnose.base_run import (
 )
 from compensator.diagnose.no_causes import no_causes
 from compensator.diagnose.noise import NoiseTest, is_far_off, noise_floor, own_error_um
-from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, decays_of, freedom_of, in_holes, zeros_of
+from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, decays_of, freedom_of, zeros_of
 from compensator.errors import DataError
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import COOLEST, EQUAL, Context, Place
@@ -269,13 +269,15 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     DataError
         If there is no y in it.
     """
+    names = ", ".join(dict.fromkeys(run.name for run in runs))
+    apart = no_causes(names, runs)
+    runs = [run.bridging(model.channels) for run in runs]
     courses = [without_noise(run) for run in runs]
     begins = beginnings(runs)
     signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
     signals = with_warmths(model, runs, signals)
     cold = [effects_of(model, run) for run in courses]
-    used = np.concatenate([np.isfinite(run.y_um) & ~in_holes(run) for run in runs])
-    names = ", ".join(dict.fromkeys(run.name for run in runs))
+    used = np.concatenate([np.isfinite(run.y_um) & ~run.in_holes for run in runs])
     # A part in which Y was never measured says nothing of how it is measured.
     sparse = all(run.has_sparse_y for run in runs if np.isfinite(run.y_um).any())
     if used.sum() < (LEAST_VALUES if sparse else LEAST_SAMPLES):
@@ -284,7 +286,6 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         raise DataError(
             f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least {LEAST_SAMPLES}"
         )
-    apart = no_causes(names, runs)
     context = context_of(model, signals, apart)
     zeros = np.asarray(block_diag(*(zeros_of(run.zero_numbers) for run in runs)))
     after = [decays_of(own, context, run.holes) for run, own in zip(runs, signals, strict=True)]
@@ -340,6 +341,6 @@ def _levelled(runs: Sequence[Run], residual: Vector) -> list[Run]:
 def _without_steps(run: Run, error: Vector) -> Run:
     if not run.zeros_s:
         return run
-    numbers, measured, y_um = run.zero_numbers, np.isfinite(run.y_um) & ~in_holes(run), run.y_um
+    numbers, measured, y_um = run.zero_numbers, np.isfinite(run.y_um) & ~run.in_holes, run.y_um
     means = [np.mean(error[measured & (numbers == number)]) for number in range(len(run.zeros_s) + 1)]
     return dataclasses.replace(run, y_um=y_um - (np.array(means) - means[0])[numbers])

@@ -100,6 +100,10 @@ class Fit:
         """Kind, path and channel of each effect."""
         return frozenset(term.hypothesis.place for term in self.terms)
 
+    def index_of(self, place: Place) -> int | None:
+        """Return which effect has a place; None without one. One that was exchanged stands at the end."""
+        return next((i for i, term in enumerate(self.terms) if term.hypothesis.place == place), None)
+
     @property
     def forms(self) -> frozenset[str]:
         """Place and form of each effect."""

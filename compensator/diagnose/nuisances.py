@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator.arrays import Indices, Mask, Matrix
-from compensator.data.runs import Run
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 
@@ -33,15 +32,10 @@ def decays_of(record: RecordSignals, context: Context, holes: Sequence[tuple[int
     fastest = FASTEST * record.period_min
     slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])
     taus = np.geomspace(fastest, slowest, 1 + math.ceil(math.log(slowest / fastest, DECAY_RATIO))).tolist()
-    longest = sorted(holes, key=lambda hole: hole[1] - hole[0])[-MOST_HOLES:]
+    followed = [hole for hole in holes if hole[1] < record.size]
+    longest = sorted(followed, key=lambda hole: hole[1] - hole[0])[-MOST_HOLES:]
     since = [record.minutes - record.minutes[begin] for begin in (0, *sorted(end for _, end in longest))]
     return np.column_stack([np.where(t >= 0.0, np.exp(-np.maximum(t, 0.0) / tau), 0.0) for t in since for tau in taus])
-
-
-def in_holes(run: Run) -> Mask:
-    """Return the samples in which the heat is unknown: what the model has of Y there says nothing."""
-    at = np.arange(run.t_s.size)
-    return np.asarray(np.any([(begin <= at) & (at < end) for begin, end in ((0, 0), *run.holes)], axis=0))
 
 
 def basis_of(nuisances: Matrix, used: Mask) -> Matrix:

@@ -127,14 +127,18 @@ class Search:
         unobserved = unobserved and not self.evidence.free_paths
         before = fit_terms(Likelihood(self.points, rest_without_effects(self.points)), [])
         self.criterion.something_acts = self.evidence.is_sparse and not self.criterion.leaves_noise(before)
-        grown, undecided = self._grown(before, unobserved=unobserved)
+        expected = self.criterion.is_expected(before)
+        unobserved = unobserved and not expected
+        # What may come by itself on another day is an error of the paths. What another channel adds is none.
+        paths = frozenset(one.place for one in self.hypotheses if expected and one.effect.kind != "input")
+        grown, undecided = self._grown(before, unobserved=unobserved, apart_from=paths)
         best = self._pruned(grown)
         if grown.terms and not best.terms:
             # What was too small to name must not keep out what is not.
-            grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
+            grown, undecided = self._grown(before, unobserved=unobserved, apart_from=paths | grown.places)
             best = self._pruned(grown)
         # What was left out as too small must not come back in the place of what it was too small beside.
-        small = grown.places - best.places
+        small = paths | (grown.places - best.places)
         best = self._with_simpler_name(self._exchanged(best, keep_last=False, apart_from=small))
         best = self._foretelling(best, apart_from=small)
         if hidden := self._hidden(undecided, best):
@@ -168,13 +172,10 @@ class Search:
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
-            if expected:
-                # What may come by itself on another day is an error of the paths. What another channel adds is none.
-                candidates = [fit for fit in candidates if fit.terms[-1].hypothesis.effect.kind == "input"]
             better = max(candidates, key=self.criterion.score, default=best)
             if self.criterion.score(better) <= self.criterion.score(best) + expected * EXPECTED:
                 return best, self._undecided(candidates, best)
-            best = self._exchanged(better)
+            best = self._exchanged(better, apart_from=apart_from)
         return best, ()
 
     def _hidden(self, undecided: Sequence[Fit], best: Fit) -> Fit | None:
@@ -240,7 +241,8 @@ class Search:
         found: list[Fit] = []
         seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
-            ranked: Iterable[Start] = self._scan.ranked(rest, fit, self.criterion.cost_of)[:FITTED]
+            all_ranked = self._scan.ranked(rest, fit, self.criterion.cost_of)
+            ranked: Iterable[Start] = [start for start in all_ranked if start[0].place not in apart_from][:FITTED]
             if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
             for start in ranked:
@@ -288,7 +290,10 @@ class Search:
         apart_from : frozenset of Place
             Effects that are not looked for.
         """
-        for i in range(len(fit.terms) - keep_last):
+        for place in [term.hypothesis.place for term in fit.terms[: len(fit.terms) - keep_last]]:
+            i = fit.index_of(place)
+            if i is None:
+                continue
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from)
             forms = [one for one in proposed if one.places == fit.places and one.forms != fit.forms]
@@ -350,8 +355,9 @@ class Search:
         if self.evidence.is_sparse or self.evidence.free_paths or self.points.is_exact:
             return fit
         folds = Folds(self.points)
-        for i, term in enumerate(fit.terms):
-            if not term.effect.observed:
+        for place in [term.hypothesis.place for term in fit.terms]:
+            i = fit.index_of(place)
+            if i is None or not (effect := fit.terms[i].effect).observed:
                 continue
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from | others.places)
@@ -360,7 +366,7 @@ class Search:
             others_settled = [
                 settled(one)
                 for one in proposed[:FITTED]
-                if one.forms != fit.forms and (term.effect.has_any_form or not one.terms[-1].effect.has_any_form)
+                if one.forms != fit.forms and (effect.has_any_form or not one.terms[-1].effect.has_any_form)
             ]
             near = [one for one in others_settled if self.criterion.score(one) > least]
             if near:
