@@ -597,13 +597,14 @@ class DataRemark(Code):
     )
     ZEROS_LEFT_OUT = (
         "zeros_left_out",
-        "A zero was set between probes; from there a feature counts anew, so only those about one zero are used.",
+        "A zero was set between probes; from there a feature counts anew, so only those about one zero are used; by a "
+        "diagnosis all but those that are alone about theirs.",
         "Export the recordings of each zero to a table of their own: each table has a zero of its own.",
     )
     SEVERAL_ZEROS = (
         "several_zeros",
-        "A zero was set between probes; from there a feature counts anew. A diagnosis uses the probes about each zero; "
-        "errors in free run are those about the zero with most of them.",
+        "A zero was set between probes; from there a feature counts anew. A diagnosis uses the probes about each zero, "
+        "in its curves set to one level; errors in free run are those about the zero with most of them.",
         "Nothing.",
     )
     VARIABLES_LEFT_OUT = (

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from compensator import display
-from compensator.codes import Remark
+from compensator.codes import DataRemark, Remark
 from compensator.data.cleaning import cleaned, refuse_at_limit
 from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
@@ -378,8 +378,12 @@ def runs_in(
             refuse_at_limit(measured.name, record)
             zeros_s = tuple(at_s - float(measured.table.t_s.min()) for at_s in measured.table.zeros_s)
             for run in runs_of(measured.label, record, whole_y=whole_y):
-                own = dataclasses.replace(run, recording=number, y_std_um=y_std_um)
-                runs.append(own.with_zeros(zeros_s) if whole_y else own)
+                one = dataclasses.replace(run, recording=number, y_std_um=y_std_um)
+                own = one.with_zeros(zeros_s) if whole_y else one
+                if left_out := int(np.sum(np.isfinite(one.y_um)) - np.sum(np.isfinite(own.y_um))):
+                    words = f"{run.name}: {left_out} probe(s) left out: alone about their zero, or beside its change."
+                    remarks.append(Remark(DataRemark.ZEROS_LEFT_OUT, words))
+                runs.append(own)
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
     return runs, remarks

@@ -35,7 +35,7 @@ _DIGITS = 9
 
 
 def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
-    """Return the channels that cannot be a cause of Y by name, each with a remark.
+    """Return the channels that are not searched by name, each with a remark: no causes of Y, or missing for hours.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def no_causes(name: str, runs: Sequence[Run]) -> dict[str, Remark]:
         if np.isnan(values).all():
             found[channel] = Remark(DataRemark.COLUMN_EMPTY, f"{name}: {channel} has no value.")
         elif missing_h > 0.0:
-            words = f"{name}: {channel} is missing for {missing_h:.1f} h; not searched. Diagnose the rows that have it."
+            words = f"{name}: {channel} is missing for {missing_h:.1f} h; not searched."
             found[channel] = Remark(DataRemark.COLUMN_MISSING, words)
         elif np.ptp(values) > 0.0:
             other = first.setdefault(np.round(values, _DIGITS).tobytes(), channel)

@@ -54,8 +54,8 @@ def _on_all(chosen: Deployment, *, deployed: bool) -> Iterator[Remark]:
         yield Remark(ModelWarning.WORSE_IN_FREE_RUN, text)
     elif chosen.too_short_h is not None:
         text = (
-            f"What was found explains a record of {chosen.too_short_h:.1f} h only in part, and in so few hours the own "
-            "error of the model looks like an effect, so it was left unchanged."
+            f"What was found explains a record of {chosen.too_short_h:.1f} h only in part, and in so few hours noise "
+            "and the model's own error look like an effect, so it was left unchanged."
         )
         yield Remark(ModelWarning.TOO_SHORT, text)
     # A source that no channel shows predicts nothing and is never deployed: what is, or could be, must.

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from compensator.diagnose import search as search_module
@@ -10,7 +11,7 @@ from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, rest_without_effects
 from compensator.diagnose.prediction import Folds
 from compensator.diagnose.search import FORETELLS, Search
-from tests.diagnose.scenarios import draw, record
+from tests.diagnose.scenarios import Scenario, draw, lag, record
 from tests.diagnose.test_own_error import BASE
 from tests.identify.quill_runs import runs_from
 
@@ -50,6 +51,35 @@ def test_what_is_clearly_more_likely_is_kept_whatever_blocks_say(monkeypatch):
     monkeypatch.setattr(search_module, "NEARLY", 1e9)
     (any_other,) = searched._foretelling(right, apart_from=frozenset()).terms
     assert not any_other.effect.has_any_form
+
+
+def test_each_effect_is_looked_at_once_in_whatever_order_they_are_exchanged(monkeypatch):
+    """One that was exchanged stands at the end: by its number another one was left out, and one never."""
+    channels = draw("input", 3, 5.0).place[2], draw("input", 5, 5.0).place[2]
+    searched = Search(evidence_of(BASE, runs_from(record([draw("input", 3, 5.0), draw("input", 5, 5.0)], 93, 24.0)[0])))
+    nothing = Likelihood(searched.points, rest_without_effects(searched.points))
+    forms = [("(square)", channels[0]), ("(row, linear)", "coolant_degc"), ("(lag)", channels[1])]
+    named = [next(h for h in searched.hypotheses if h.label == f"input {name} {form}") for form, name in forms]
+    fit = settled(fit_terms(nothing, [(hypothesis, hypothesis.grid()[0]) for hypothesis in named]))
+    monkeypatch.setattr(search_module, "NEARLY", 1e9)
+    monkeypatch.setattr(  # each exchange foretells better, and best a form of any lags
+        Folds,
+        "error_um",
+        lambda _, one: 0.1 ** sum(term.effect.has_any_form for term in one.terms) if one is not fit else 1e6,
+    )
+    chosen = searched._foretelling(fit, apart_from=frozenset())
+    by_channel = {term.hypothesis.place[2]: term.effect.has_any_form for term in chosen.terms}
+    assert by_channel == {channels[0]: False, "coolant_degc": True, channels[1]: False}
+
+
+def test_within_the_own_error_nothing_but_an_input_is_named():
+    """A channel that acts in two ways: a change of a path by it may come by itself on another day."""
+    lagged = Scenario(place=("input", "", "fan_rpm"), act=lambda s: 1.6 * (e := lag(s[1]["fan_rpm"], 20.0)) / np.std(e))
+    columns, _, _ = record([draw("scheduled", 4, 2.6), lagged], 94, 24.0)
+    searched = Search(evidence_of(dataclasses.replace(BASE, held_out_rms_um=3.0), runs_from(columns)))
+    found = searched.run(unobserved=False)
+    assert searched.criterion.is_expected(found.before)
+    assert [term.hypothesis.place for term in found.fit.terms] == [lagged.place]
 
 
 @pytest.mark.parametrize(("kind", "size_um", "is_named"), [("input", 2.0, True), ("none", 0.0, False)])

@@ -1,10 +1,15 @@
 """What a record does not have: T_Q for some minutes, a channel for hours, the time before it began."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.data.measurement import read
 from tests.diagnose.scenarios import draw, record
+from tests.diagnose.test_sparse_y import STD_UM, probed
+from tests.diagnose.test_warm_start import diagnosed, warm
 
 HOURS = 44.0
 
@@ -53,6 +58,28 @@ def test_y_counts_from_one_zero_before_and_after_t_q_was_missing_for_hours():
     assert "the record is split there" in beside.remarks[0] and beside.diagnosis.evidence.zeros.shape[1] == 2
 
 
+@pytest.mark.parametrize(("first", "count"), [(5, 0), (1500, 2)])
+def test_a_zero_whose_probes_all_lie_in_a_hole_shows_nothing(first, count):
+    """The mean of none as its level ended the search with an error."""
+    columns = probed("none", 1, every=15)
+    measured = read(columns | {"t_q_degc": without(columns["t_q_degc"], first, first + 50)})
+    zeros_s = [60.0 * at + 20.0 for at in (first - 1, first + 50) if at > 5]
+    measured = dataclasses.replace(measured, table=dataclasses.replace(measured.table, zeros_s=tuple(zeros_s)))
+    why = tc.diagnose("quill", measured, y_std_um=STD_UM)
+    assert why.verdict == "adequate" and why.diagnosis.evidence.zeros.shape[1] == max(count, 1)
+
+
+def test_probes_that_are_alone_about_a_zero_are_counted():
+    measured = read(columns := probed("none", 1, every=15))
+    at_s = columns["t_s"][np.isfinite(columns["y_um"])]
+    measured = dataclasses.replace(
+        measured, table=dataclasses.replace(measured.table, zeros_s=tuple(at_s[:10] - 400.0))
+    )
+    why = tc.diagnose("quill", measured, y_std_um=STD_UM)
+    (remark,) = [remark for remark in why.remarks if remark.code == "zeros_left_out"]
+    assert "9 probe(s) left out" in remark
+
+
 @pytest.mark.parametrize(("first", "last"), [(0, 720), (900, 1500)])
 def test_a_channel_that_is_missing_for_hours_is_not_searched_and_said(first, last):
     """A line through such a gap is another channel than the service has."""
@@ -62,6 +89,25 @@ def test_a_channel_that_is_missing_for_hours_is_not_searched_and_said(first, las
     assert channel not in [effect.channel for effect in why.effects]
     (remark,) = [remark for remark in why.remarks if remark.code == "column_missing"]
     assert f"{channel} is missing for {(last - first) / 60.0:.1f} h" in remark
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 300), (900, 1500), (2340, 2640)])
+def test_while_a_channel_of_the_model_is_missing_y_says_nothing(first, last):
+    """What its effect adds is not known; a right model lacked a source that no channel shows."""
+    machine = [draw("input", 3, 5.0)]
+    base = tc.diagnose("quill", frame(record(machine, 7, HOURS)[0])).model
+    (channel,) = base.channels
+    columns, _, _ = record(machine, 8, HOURS)
+    why = tc.diagnose(base, frame(columns, **{channel: without(columns[channel], first, last)}))
+    assert why.verdict == "adequate" and not why.effects
+    assert not why.diagnosis.evidence.used[first:last].any()
+
+
+def test_a_record_that_begins_warm_may_lack_the_channel_by_which_the_model_is_scheduled():
+    columns, base = warm("scheduled")[1], diagnosed("scheduled").model
+    (channel,) = base.channels
+    why = tc.diagnose(base, frame(columns, **{channel: without(columns[channel], 600, 720)}))
+    assert why.diagnosis.evidence.count < columns["y_um"].size - 119
 
 
 def test_a_channel_that_one_of_several_recordings_lacks_is_said():
