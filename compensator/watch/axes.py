@@ -13,19 +13,24 @@ from compensator.messages import Offset
 from compensator.messages_axes import SHOWN_UNITS, UNITS, AxisOffset
 
 
-def worst(offset: Offset, axes: Mapping[str, AxisOffset]) -> tuple[str, list[str]]:
-    """Return the worst state of all axes of a sample, and the reasons of all, each once.
+def worst(offset: Offset, axes: Mapping[str, AxisOffset], before: int) -> tuple[str, list[str]]:
+    """Return the worst state of all axes, and the reasons of all, each once.
+
+    The offsets of a sample arrive one after the other: until that of the newest sample is here, an axis counts with
+    that of the sample before.
 
     Parameters
     ----------
     offset : Offset
         Of Y.
     axes : mapping of str to AxisOffset
-        Those of further axes that were received last; of another sample they do not count.
+        Those of further axes that were received last; older ones than `before` do not count.
+    before : int
+        Number of the sample before that of `offset`.
     """
-    same = [one for one in axes.values() if one.seq == offset.seq and one.machine == offset.machine]
-    state = worst_state(one.state for one in (offset, *same))
-    return state, list(dict.fromkeys(reason for one in (offset, *same) for reason in one.reasons))
+    valid = [one for one in axes.values() if one.seq >= before and one.machine == offset.machine]
+    state = worst_state(one.state for one in (offset, *valid))
+    return state, list(dict.fromkeys(reason for one in (offset, *valid) for reason in one.reasons))
 
 
 def missing_axes(offset: Offset | None, axes: Mapping[str, AxisOffset], due: int | None = None) -> list[str]:

@@ -288,9 +288,9 @@ class WatchedMachine:
         return WatchWarning.SILENT if old_s > self._offset.valid_for_s else self._worst()[0]
 
     def _worst(self) -> tuple[str, list[str]]:
-        """Return the worst state of all axes of the last sample, and the reasons of all."""
+        """Return the worst state of all axes, and the reasons of all."""
         assert self._offset is not None
-        return worst(self._offset, self._axes)
+        return worst(self._offset, self._axes, self._seq_before)
 
     def warnings(self, now_ns: int, monotonic_s: float) -> list[Remark]:
         """Return warnings about what was received."""

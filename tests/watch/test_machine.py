@@ -295,6 +295,20 @@ def test_an_axis_that_stays_away_is_not_taken_to_be_on_its_way_with_each_sample(
     assert "axis_missing" not in heard.machine["warning_codes"]  # numbers of another machine
 
 
+@pytest.mark.parametrize("order", ["yz", "zy"])
+def test_no_machine_may_cut_while_an_axis_in_hold_is_on_its_way(heard: Heard, order: str) -> None:
+    """The axes of a sample arrive one after the other, and one may be lost."""
+    for seq, arriving in ((5, order), (6, order), (7, "y")):
+        for axis in arriving:
+            held = {"state": "hold", "reasons": ["t_q_missing"]} if axis == "z" else {}
+            heard.hear(**{f"{axis}/offset": axis_offset(axis, seq, heard.clock.now_ns, **held)})
+            if seq > 5:
+                assert (heard.machine["shown"], heard.machine["headline"]["cut"]) == ("hold", "no")
+                assert [reason["code"] for reason in heard.machine["reasons"]] == ["t_q_missing"]
+        heard.clock.advance(60)
+    assert heard.machine["headline"]["cut"] == "no" and heard.machine["warning_codes"] == ["axis_missing"]
+
+
 def test_an_axis_that_answers_no_query_is_missing_at_once() -> None:
     """`watch --once` shows what was answered and waits for nothing."""
     shop = Shop(Clock())
