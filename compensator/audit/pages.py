@@ -127,7 +127,8 @@ def _proven(found: Audit) -> Table:
     chained = found.chained
     records = sum(file.records for file in chained)
     kinds = found.counts
-    of_files = sum(count for kind, count in found.of_files.items() if kind not in _APART)
+    # A copy is inserted; no file is missing for it.
+    of_files = sum(count for kind, count in found.of_files.items() if kind not in (*_APART, AuditFinding.INSERTED))
     of_records = sum(count for kind, count in kinds.items() if kind not in _APART) - of_files
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)

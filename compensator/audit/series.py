@@ -272,6 +272,8 @@ def combine(
         before, between = None, list[RecordingAudit]()
         for after in of_machine:
             series.check_file(after)
+            if after.last and before is not None and after.original == before.original:
+                continue  # a copy is a finding, and has no place of its own in the chain
             if after.last:
                 series.check_link(before, between, after)
                 before, between = after, []

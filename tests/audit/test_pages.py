@@ -78,6 +78,14 @@ def test_a_file_that_is_missing_is_not_proven(tmp_path: Path, capsys: pytest.Cap
     assert [*outcomes(text).values()][:3] == ["✓", "✓", "✗"] and 'href="#word-missing_file"' in text
 
 
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_copy_is_inserted_and_no_missing_file(rec: Path, capsys: pytest.CaptureFixture[str], which: int) -> None:
+    shutil.copy(recordings(rec, MACHINE)[which], rec / "copy.mcap")
+    text = page(capsys, 3, rec)
+    assert [*outcomes(text).values()][1:3] == ["✗", "✓"] and 'href="#word-inserted"' in text
+    assert "Not proven: 1 finding(s) in 3" in text and "begins_new_chain" not in text
+
+
 @pytest.mark.parametrize(("which", "distance"), [("sample", 1), ("chain", 3)])
 def test_records_in_another_place_are_no_missing_file(
     rec: Path, capsys: pytest.CaptureFixture[str], which: str, distance: int
