@@ -220,19 +220,15 @@ class Installation:
             raise InstallError(f"{version.name} cannot use {config}: {lines[-1]}")
         name = config.parent.name
         table = tomllib.loads(read(config).decode("utf-8-sig"))
-        folder = (Path(CONFIGURATIONS) / name / table["recording"]["folder"]).as_posix()
-        if not os.path.normpath(folder).startswith(f"{RECORDINGS}/{name}/"):
-            raise InstallError(
-                f"{config}: recording.folder = {table['recording']['folder']!r}, expected a folder below "
-                f"{RECORDINGS}/{name}/, the only place that the service may write to"
-            )
-        for kind, key in (("model", "store"), ("recording", "head")):
+        for kind, key in (("recording", "folder"), ("recording", "head"), ("model", "store")):
             given = table.get(kind, {}).get(key)
-            place = os.path.normpath(Path(CONFIGURATIONS) / name / given) if given else ""
-            if place.startswith(f"{CONFIGURATIONS}/"):
+            if given is None:
+                continue
+            place = os.path.normpath(Path(CONFIGURATIONS) / name / given)
+            if not place.startswith(f"{RECORDINGS}/{name}/"):
                 raise InstallError(
-                    f"{config}: {kind}.{key} = {given!r}, expected a place below {RECORDINGS}/{name}/: below "
-                    f"{CONFIGURATIONS} the service may not write"
+                    f"{config}: {kind}.{key} = {given!r}, expected a place below {RECORDINGS}/{name}/, the only one "
+                    "that the service may write to"
                 )
         report(f"{config}: valid for {version.name}")
 
