@@ -263,7 +263,8 @@ def parse() -> argparse.Namespace:
     for option, least in (("days", -EXPIRED_DAYS), ("ca_days", 1), ("renew_below", 0)):
         value = getattr(arguments, option)
         if not least <= value <= LONGEST_DAYS or (option == "days" and value == 0):
-            parser.error(f"--{option.replace('_', '-')} {value}: expected at most {LONGEST_DAYS} days")
+            besides = ", not 0" if option == "days" else ""
+            parser.error(f"--{option.replace('_', '-')} {value}: expected {least} to {LONGEST_DAYS} days{besides}")
     for host in arguments.router:
         if not re.fullmatch("[!-~]+", host):
             parser.error(f"--router {host!r}: expected an address, or a name in ASCII such as router.shop")

@@ -191,22 +191,24 @@ def is_good(path: Path) -> bool:
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("option", "value", "expected"),
     [
-        ("--days", "99999999"),
-        ("--days", "0"),
-        ("--days", "-36500"),
-        ("--ca-days", "-2"),
-        ("--ca-days", "0"),
-        ("--renew-below", "nan"),
-        ("--router", "r\u00f6uter"),
-        ("--router", ""),
+        ("--days", "99999999", "-3650 to 36500 days, not 0"),
+        ("--days", "0", "-3650 to 36500 days, not 0"),
+        ("--days", "-36500", "-3650 to 36500 days, not 0"),
+        ("--ca-days", "-2", "1 to 36500 days"),
+        ("--ca-days", "0", "1 to 36500 days"),
+        ("--renew-below", "nan", "0 to 36500 days"),
+        ("--router", "r\u00f6uter", "an address"),
+        ("--router", "", "an address"),
     ],
 )
-def test_what_no_certificate_can_have_is_refused_before_a_key_is_made(tmp_path: Path, words: tuple[str, str]) -> None:
+def test_what_no_certificate_can_have_is_refused_before_a_key_is_made(
+    tmp_path: Path, option: str, value: str, expected: str
+) -> None:
     folder = tmp_path / "keys"
-    error = script("certificates.py", str(folder), "--machine", "m1", *words, code=2)
-    assert words[0] in error and "Traceback" not in error and not folder.exists()
+    error = script("certificates.py", str(folder), "--machine", "m1", option, value, code=2)
+    assert option in error and f"expected {expected}" in error and "Traceback" not in error and not folder.exists()
 
 
 def test_an_authority_that_has_expired_signs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
