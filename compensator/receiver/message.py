@@ -20,8 +20,8 @@ FURTHER = ("x", "z", "a", "b")
 _STATES = ("starting", "ok", "degraded", "hold", "fault")
 #: States of which a receiver follows the offset.
 USABLE = ("ok", "degraded")
-#: Number of codes in a message, and their length.
-_CODES_MAX, _CODE_LENGTH = 100, 200
+#: Most codes in a message: one for each channel that effects use, and those of the service; and their length.
+CODES_MAX, _CODE_LENGTH = 150, 200
 
 
 class Rejected(Exception):
@@ -127,8 +127,8 @@ def header_of(table: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(machine, str) or not machine:
         raise malformed("machine", machine, "a name")
     reasons = table.get("reasons")
-    if not isinstance(reasons, list) or len(reasons) > _CODES_MAX or not all(map(_is_code, reasons)):
-        raise malformed("reasons", reasons, "a list of codes")
+    if not isinstance(reasons, list) or len(reasons) > CODES_MAX or not all(map(_is_code, reasons)):
+        raise malformed("reasons", reasons, f"a list of at most {CODES_MAX} codes")
     return {
         "machine": machine,
         "valid_for_s": seconds(table),

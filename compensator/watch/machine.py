@@ -25,6 +25,7 @@ from compensator.messages import (
     read_message,
 )
 from compensator.messages_axes import ALL_MESSAGES, OFFSETS, UNITS, AxisOffset, axis_of, names_axes, topic_of
+from compensator.receiver.message import CODES_MAX
 from compensator.watch.axes import axis_snapshot, missing_axes, worst
 from compensator.watch.cutting import ATTENTION, FORBID, Headline, headline
 from compensator.watch.history import AHEAD_NS, MachineHistory, usable
@@ -55,8 +56,6 @@ EVENTS = 50
 EVENT_BYTES = 2**16
 #: Most effects of a model (`model/model_file.py`, which would bring NumPy with it).
 EFFECTS = 100
-#: Most reasons of an offset or a status: one for each channel that effects use, and those of the service.
-REASONS = EFFECTS + 50
 #: Longest text of an event that is kept and shown whole, characters; those of services are a few lines at most.
 TEXT = 2000
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
@@ -102,7 +101,7 @@ def decoded(kind: str, payload: bytes) -> Any:
         raise Malformed(f"{kind}: {error}") from error
     if message.schema != SCHEMA:
         raise Malformed(f"{kind}: schema = {message.schema}, expected {SCHEMA}")
-    for name, most in (("y_effects_um", EFFECTS), ("reasons", REASONS)):
+    for name, most in (("y_effects_um", EFFECTS), ("reasons", CODES_MAX)):
         count = len(getattr(message, name, ()))
         if count > most:  # each of them would be kept for a day
             raise Malformed(f"{kind}: {count} {name}, expected at most {most}")

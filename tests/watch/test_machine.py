@@ -14,9 +14,10 @@ from compensator.clock import NS
 from compensator.messages import Candidate, EstimateMessage, Event, Offset, Sample, Status
 from compensator.messages_axes import AxesEstimate
 from compensator.model.model_file import EFFECTS
+from compensator.receiver import Rejected, parse_offset
 from compensator.watch import past
 from compensator.watch.history import MachineHistory, state_intervals
-from compensator.watch.machine import WatchedMachine, decoded
+from compensator.watch.machine import Malformed, WatchedMachine, decoded
 from compensator.watch.shop import Shop
 from tests.watch.heard import LOOP, START_NS, Clock, axis_offset, estimate, event, offset, sample, status
 
@@ -168,6 +169,17 @@ def test_more_than_any_service_has_is_no_message(heard: Heard, message: dict[str
     heard.hear(offset=offset(5), estimate=estimate(5, effects=(1.5,) * EFFECTS))
     heard.hear(**message)
     assert (heard.machine["malformed"], heard.machine["seq"], len(heard.machine["shares"])) == (1, 5, EFFECTS + 2)
+
+
+def test_the_watch_takes_as_many_reasons_as_a_receiver() -> None:
+    """A device with a hundred channels that fails gives a reason for each of them."""
+    reasons = [f"channel_missing:c{i}" for i in range(151)]
+    most, more = (offset(5, state="degraded", reasons=reasons[:count]) for count in (150, 151))
+    assert decoded("offset", most).reasons == list(parse_offset(most).reasons) == reasons[:150]
+    with pytest.raises(Malformed, match="at most 150"):
+        decoded("offset", more)
+    with pytest.raises(Rejected, match="at most 150"):
+        parse_offset(more)
 
 
 def test_what_strangers_publish_is_not_kept_for_a_day(heard: Heard) -> None:
