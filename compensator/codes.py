@@ -973,7 +973,7 @@ class AuditRemark(Code):
     )
     BEGINS_NEW_CHAIN = (
         "begins_new_chain",
-        "The hash chain starts with this file: no earlier recording existed when it was created.",
+        "The hash chain starts with this file, which states that there was no record before; some may be missing.",
         "Nothing, if the machine was newly installed; otherwise find the earlier recordings.",
     )
     BEFORE_NOT_GIVEN = (

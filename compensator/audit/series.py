@@ -14,7 +14,7 @@ from typing import Any
 from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
-from compensator.audit.verdict import partly, verdict
+from compensator.audit.verdict import has_unchecked, partly, verdict
 from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.errors import DataError, UsageError, one_line
 from compensator.recording.chain import NOTHING
@@ -495,7 +495,7 @@ def summary(found: Audit) -> str:
     if not samples:
         lines.append("No sample was replayed.")
     elif not found.differing:
-        every = "of the samples that it could replay" if not found.clean or partly(found) else ""
+        every = "of the samples that it could replay" if not found.clean or has_unchecked(found) else ""
         words = ["The replay reproduces every estimate and every offset", every]
         decided = f" It makes the {found.decisions} decisions of the loop again, on the same figures."
         lines.append(f"{' '.join(filter(None, words))}, bit for bit.{decided if found.decisions else ''}")

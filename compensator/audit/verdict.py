@@ -36,5 +36,9 @@ def verdict(found: Audit) -> str:
 
 def partly(found: Audit) -> bool:
     """Return whether a part could not be checked."""
-    unchecked = any(not file.last or file.not_replayed for file in found.files)
-    return not found.samples or unchecked or bool(found.restarts)
+    return has_unchecked(found) or bool(found.restarts)
+
+
+def has_unchecked(found: Audit) -> bool:
+    """Return whether a part of what is in the files could not be checked; between them some may be missing besides."""
+    return not found.samples or any(not file.last or file.not_replayed for file in found.files)
