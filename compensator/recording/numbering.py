@@ -50,7 +50,8 @@ def first_sequence(
     period_s : float
         Length of a sample, s.
     keeper : HeadKeeper, optional
-        The head: what is in its chain counts, and of the rest what can have been published since it was written.
+        The head: what is in its chain counts, and of the rest what can have been published since it was written, by
+        the time that has passed or by the number of samples.
     remark : callable
         Called with file and text where a number cannot be one that was published.
     """
@@ -58,10 +59,13 @@ def first_sequence(
     most = min(int(_PER_S * max(since_s, _LEAST_S)), SEQ_MAX // 2)
     last = last_sequence(folder, machine, most=most, keeper=keeper, remark=remark)
     if keeper is not None and keeper.ends:
-        # A service whose head could not be written goes on. More samples than periods have passed it cannot have
-        # published, so whoever writes the folder gains nothing.
+        # A service whose head could not be written goes on. It cannot have published more samples than periods have
+        # passed or, where the clock was set back, than are on disk. Whoever writes the folder gains nothing: a number
+        # more costs a sample, and `most` stays.
         passed = max(utc_ns - keeper.time_utc_ns, 0) / 1e9 // period_s
-        last = max(last, last_sequence(folder, machine, most=min(most, last + int(passed) + 2)))
+        behind = _behind(folder, machine, last)
+        most = min(most, last + max(int(passed), len(behind)) + 2)
+        last = max((number for number in behind if number <= most), default=last)
     return max(last + 1, int(since_s // period_s), 0)
 
 
@@ -109,6 +113,16 @@ def _by_name(folder: Path, machine: str) -> Iterator[_Numbers]:
             for message in messages(path, _NUMBERED):
                 found.add(message.seq)
         yield _Numbers(path.name, found)
+
+
+def _behind(folder: Path, machine: str, last: int) -> set[int]:
+    """Return the numbers above the last one in the newest recordings."""
+    behind: set[int] = set()
+    for numbers in _by_name(folder, machine):
+        behind |= {number for number in numbers.found if number > last}
+        if min(numbers.found, default=last + 1) <= last:
+            break
+    return behind
 
 
 def _by_head(folder: Path, keeper: HeadKeeper) -> Iterator[_Numbers]:

@@ -116,8 +116,9 @@ def test_a_number_behind_the_head_is_not_taken(tmp_path: Path, seq: int) -> None
     assert shop.start().recorder.first_sequence(START_NS, 60.0) == PERIODS + 29
 
 
+@pytest.mark.parametrize("set_back_min", [0, 10, 600])
 def test_a_service_whose_head_could_not_be_written_has_published_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, set_back_min: int
 ) -> None:
     shop, ahead = Shop(tmp_path), 2 * PERIODS
     service = shop.start(ahead)
@@ -125,10 +126,12 @@ def test_a_service_whose_head_could_not_be_written_has_published_more(
     service.run(5)
     with monkeypatch.context() as patched:
         patched.setattr("compensator.recording.head.replace_file", Mock(side_effect=OSError(30, "read-only")))
-        service.run(50).kill()
-    later_ns = START_NS + 56 * MINUTE_NS
+        service.run(30)
+        service.recorder.start_new()
+        service.run(20).kill()
+    later_ns = START_NS + (56 - set_back_min) * MINUTE_NS
     assert shop.start().recorder.first_sequence(later_ns, 60.0) == ahead + 55
-    # More than can have been published since then is none of its numbers.
+    # A number ahead of the time and of the samples since then is none of its numbers.
     rechained(shop.files[-1], lambda lines: [*lines[:-4], *renumbered(lines[-4:], ahead + 1000, ahead + 54)])
     assert shop.start().recorder.first_sequence(later_ns, 60.0) == ahead + 54
 
