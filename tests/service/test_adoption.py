@@ -18,13 +18,17 @@ import pytest
 
 from compensator.errors import ServiceError
 from compensator.messages import number
+from compensator.model.model_file import parse_model
 from compensator.recording.reading import recordings
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import opening_of
 from compensator.service.transfer import adoption
+from compensator.service.transfer import second_opinion as second_opinion_module
+from compensator.service.transfer import warm_up as warm_up_module
 from compensator.service.transfer.adoption import Adoption
 from compensator.service.transfer.model_store import ModelStore, sha256_of
-from compensator.service.transfer.warm_up import Successor
+from compensator.service.transfer.second_opinion import second_opinion
+from compensator.service.transfer.warm_up import RecordedRun, Successor, warm_up, window_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 
@@ -309,6 +313,40 @@ async def test_a_pause_before_it_takes_over_passes_for_it_too(
     assert len(new) == 21
     assert [one.estimate for one in new] == [whole[one.offset.time_utc_ns].estimate for one in new]
     assert check_files(machine) == len(machine.outcomes)
+
+
+@pytest.mark.parametrize("zero", ["", "rest", "warm"])
+async def test_a_model_keeps_its_level_however_long_ago_it_was_in_force_until_a_zero(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zero: str
+) -> None:
+    """The loop had raised it; a warm-up does not look back so far."""
+    machine = Machine(tmp_path, SLOW)
+
+    def raised() -> None:
+        assert machine.daemon is not None
+        machine.daemon._compensation.raise_level(6.0)
+        machine.daemon._journal.start_new_file()
+
+    machine.at_sample[60] = raised
+    machine.at_sample[90] = Asked(machine, "adopt", payload(STRONGER, force=True))
+    if zero:
+        machine.at_sample[150] = Asked(machine, "zero", json.dumps({"mode": zero}).encode())
+    await machine.run(300)
+    monkeypatch.setattr(warm_up_module, "WARM_UP", 0.3)
+    monkeypatch.setattr(second_opinion_module, "COMPARED_H", 0.2)
+    assert machine.events("adopt")[-1].data["ok"]
+    own, other = (parse_model(data, source="test") for data in (QUILL, STRONGER))
+    level_um = 0.0 if zero else 6.0
+    window = window_of(machine.recordings, MACHINE, slowest_min(own), lambda: None)
+    assert zero or window.from_ns > machine.outcomes[90].offset.time_utc_ns
+    back = warm_up(machine.recordings, machine.config, own).compensation
+    assert back.level_um == level_um and back.status.zero is not None
+    assert warm_up(machine.recordings, machine.config, other).compensation.level_um == 0.0
+    moves_um = second_opinion(machine.recordings, machine.config, other, own).offset_change_um
+    monkeypatch.setattr(RecordedRun, "begin_at_level", lambda run, window: None)
+    without_um = second_opinion(machine.recordings, machine.config, other, own).offset_change_um
+    assert moves_um is not None and without_um is not None
+    assert without_um - moves_um == pytest.approx(level_um)
 
 
 async def test_back_and_further_back_to_the_configured_one(tmp_path: Path) -> None:

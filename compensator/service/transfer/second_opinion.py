@@ -172,6 +172,7 @@ def _run(
         run.compensation.begin(None)
         if window.at_rest is not None:
             run.process(window.at_rest)
+            run.begin_at_level(window)
     for step in _steps(window, between_samples):
         sample = step.sample
         if sample is not None and (sample.seq <= runs[0].seq or sample.time_utc_ns < window.from_ns):
@@ -185,6 +186,7 @@ def _run(
             begun = True
             for run in runs:
                 run.compensation.begin(zero)
+                run.begin_at_level(window)
         levels_um = [run.compensation.level_um for run in runs]
         outcomes = [outcome for run in runs if (outcome := run.process(step)) is not None]
         # What a model left before its level was raised is not comparable either.

@@ -20,10 +20,10 @@ from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, command_of
 from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording.reading import RawRecord, decode, files_since, read_messages, recordings
+from compensator.recording.reading import RawRecord, decode, files_since, messages, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
-from compensator.service.state import decode_state
+from compensator.service.state import CompensationState, decode_state
 from compensator.service.status import Zero
 from compensator.service.transfer.shadow import Shadow
 
@@ -109,6 +109,7 @@ def warm_up(
         raise DataError(f"{folder}: no recorded zero, and the previous model used absolute temperatures")
     else:
         compensation.begin(zero)
+    run.begin_at_level(window)
     for path in window.files:
         for step in usable_steps(path):
             sample = step.sample
@@ -160,6 +161,10 @@ class RecordedRun:
         """Time from the first sample to the last, min."""
         return (self._free.time_ns - self._first_ns) / (60.0 * NS)
 
+    def begin_at_level(self, window: Window) -> None:
+        """Take the level at which the model was in force before the window."""
+        self._raise_to(window.levels_um.get(self.compensation.model.sha256, 0.0))
+
     def process(self, step: RecordedStep) -> Outcome | None:
         """Process one recorded group; return the outcome of its sample.
 
@@ -197,7 +202,10 @@ class RecordedRun:
         offset, estimate = step.offset, step.estimate
         if offset is None or estimate is None or offset.model_sha256 != self.compensation.model.sha256:
             return
-        raised_um = (estimate.level_um or 0.0) - self.compensation.level_um
+        self._raise_to(estimate.level_um or 0.0)
+
+    def _raise_to(self, level_um: float) -> None:
+        raised_um = level_um - self.compensation.level_um
         if raised_um:
             self.compensation.raise_level(raised_um)
 
@@ -220,6 +228,8 @@ class Window:
         Where the run must start, and the last sample, ns since 1970 UTC.
     at_rest : RecordedStep or None
         The zero at rest with which it starts; None if there is none.
+    levels_um : dict of str to float
+        The last level at which each model was in force between the current zero and the window, by its hash, µm.
     """
 
     zero: Zero
@@ -227,6 +237,7 @@ class Window:
     from_ns: int
     end_ns: int
     at_rest: RecordedStep | None = None
+    levels_um: dict[str, float] = field(default_factory=dict)
 
 
 def window_of(
@@ -259,8 +270,13 @@ def window_of(
         raise DataError(f"{folder}: no recorded zero")
     span_ns, known_ns = round(WARM_UP * slowest * 60 * NS), last.time_utc_ns - compared_ns
     window = Window(zero=zero, files=files, from_ns=known_ns - span_ns, end_ns=last.time_utc_ns)
+    is_current, passed = True, list[Path]()  # a level begins with a file
     for path in reversed(files):
-        opening = _opening_zero(path)
+        state = _opening_state(path)
+        opening = _zero_of(state)
+        passed.append(path)
+        if is_current and state is not None and state.memory.time_utc_ns < window.from_ns:
+            is_current = _note_level(window, state, passed)
         if opening is not None and opening.equals(zero):
             continue  # the zero was set before this file
         zeros = []
@@ -278,6 +294,8 @@ def window_of(
             # The deformation is relative to the model's prediction at a zero on a warm machine, so the state must be
             # known there too.
             window.from_ns = min(window.from_ns, at_ns - span_ns)
+            # The run sees all that was in force since the current zero.
+            window.levels_um, is_current = {}, False
         if window.at_rest is not None:
             break
         zero = opening or zero
@@ -306,10 +324,31 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
     return None
 
 
-def _opening_zero(path: Path) -> Zero | None:
-    """Return the zero at the start of a recording; None if it does not show one."""
+def _note_level(window: Window, state: CompensationState, passed: list[Path]) -> bool:
+    """Note the level of the model in force, the newest of each; return whether no zero was set in the files passed."""
+    if state.model_sha256 in window.levels_um:
+        return True
+    # Two zeros of a machine at rest may have the same values.
+    if state.zero.level and any(map(_sets_zero, passed)):
+        return False
+    window.levels_um[state.model_sha256] = state.zero.level
+    return True
+
+
+def _opening_state(path: Path) -> CompensationState | None:
+    """Return the state at the start of a recording; None if it cannot be read."""
     try:
-        state = decode_state(opening_of(path).get("state.json", b""))
+        return decode_state(opening_of(path).get("state.json", b""))
     except DataError:
         return None
-    return Zero.of_references(state.engine, state.zero, state.axes or {})
+
+
+def _zero_of(state: CompensationState | None) -> Zero | None:
+    return None if state is None else Zero.of_references(state.engine, state.zero, state.axes or {})
+
+
+def _sets_zero(path: Path) -> bool:
+    """Return whether a zero was set within a recording."""
+    with suppress(DataError):
+        return any(event.kind == EventKind.ZERO for event in messages(path, ("event",)))
+    return False
