@@ -308,6 +308,7 @@ class Continuity:
         """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""
         self._zero.y_base -= um
         self._zero.level += um
+        self._jumps.raise_level(um)
         if self.probing is not None:
             self.probing.raise_level(um)
 

@@ -314,3 +314,23 @@ def test_one_wrong_value_leaves_an_unconfirmed_channel_as_it_was(channel: str) -
     assert "suspect_channel:t_q_degc" in outcomes[at].offset.reasons
     apart = offsets(outcomes) - offsets(whole)
     assert np.max(np.abs(apart[at + 8 :])) < 0.5
+
+
+@pytest.mark.parametrize(("wrong_k", "gap", "level_um"), [(3.0, 40, 12.0), (0.0, 40, 6.0), (0.0, 40, -6.0)])
+def test_a_level_that_is_raised_while_a_channel_is_in_question_is_that_of_measured_y_from_then_on(
+    day: dict[str, np.ndarray], wrong_k: float, gap: int, level_um: float
+) -> None:
+    """Y stands off since an effect began, and the loop adopts what explains it, two samples after T_Q has returned."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        values["y_um"] += level_um if i >= 150 else 0.0
+        values["t_q_degc"] += np.nan if 300 <= i < 300 + gap else wrong_k if i >= 300 + gap else 0.0
+
+    def raised(i: int, compensation: Compensation) -> None:
+        if i == 300 + gap + 2:
+            compensation.raise_level(level_um)
+
+    outcomes = run(day, change, raised, y=True)
+    assert "unconfirmed_channel:t_q_degc" in outcomes[300 + gap + 10].offset.reasons
+    after = [outcome.offset.state for outcome in outcomes[300 + gap + 60 :]]
+    assert all(state != "ok" for state in after) if wrong_k else "ok" in after[:10]

@@ -139,6 +139,11 @@ class JumpWatch:
         self._learned_um = 0.0
         self._end_hindsight()
 
+    def raise_level(self, um: float) -> None:
+        """Account for a prediction that is raised by a constant, µm: so is what measured Y is without deformation."""
+        self._zero_um += um
+        self._hindsight.end()
+
     def pass_time(self, samples: int, *, held: bool) -> None:
         """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
         self._jump.pass_time(samples, held=held)
