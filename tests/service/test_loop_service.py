@@ -29,6 +29,7 @@ from compensator.messages import Candidate, Event, number
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.event_log import EventLog
+from compensator.service.loop.compared import Compared
 from compensator.service.loop.process import DiagnosisProcess
 from compensator.service.loop.run import LoopRun
 from compensator.service.loop.state import LoopState, Running, decode_loop
@@ -490,6 +491,19 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert {one.role for one in machine.candidates()[-30:]} == {"before"}
     assert machine.events("adopt")[-1].data["by"] == "loop"
+    checked(machine)
+
+
+async def test_a_stored_model_has_its_level_though_the_configuration_was_edited_before_its_first_sample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Compared, "level_at_adoption_um", property(lambda self: 6.0))
+    machine = await killed_as_the_model_was_stored(tmp_path)
+    machine.use(machine.config_bytes + b"# a remark\n")
+    for _ in range(2):
+        await machine.run(3)
+        assert machine.outcomes[-1].offset.model_sha256 == sha256_of(extended())
+        assert machine.outcomes[-1].estimate.level_um == 6.0
     checked(machine)
 
 

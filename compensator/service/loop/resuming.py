@@ -2,7 +2,8 @@
 
 The last file is replayed with its own configuration and model, as the compensation is. After a kill between storing a
 model and the sample with it, the exchange is completed here. If a person has changed configuration or model, or the
-loop has been off, the shadow ends; what was gone back from or dismissed stays known.
+loop has been off, the shadow ends; what was gone back from or dismissed stays known. A stored model whose exchange was
+not completed has the level that was decided for it, whatever was changed.
 """
 
 from __future__ import annotations
@@ -74,13 +75,16 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mod
         return core
     core = last.core
     core.state.missing = 0  # how long the service has been away is known from the last sample on
+    is_stored = core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256
     if last.config == loaded.data and last.is_last:
         if last.compensation.model.sha256 == present.model.sha256:
             resumed.notes += core.loop.restarted()
             return core
-        if core.incoming is not None and core.incoming.compensation.model.sha256 == present.model.sha256:
+        if is_stored:
             resumed.notes += _complete(resumed, last)
             return core
+    if is_stored and last.is_last:
+        present.raise_level(core.state.level_um)  # no zero was set since the decision
     effects, now_ns = effect_names(present.model.effects), present.status.time_utc_ns
     if not last.is_last:
         # No clock was set while it was off, and nothing that it counts went on.
