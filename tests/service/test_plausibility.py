@@ -281,18 +281,22 @@ def test_exchanged_at_the_start_is_seen_once_heat_has_come_and_latched(day: dict
     assert largest_step(outcomes) <= 8.0 + 1e-9
 
 
-@pytest.mark.parametrize(("stop", "after"), [(720, 15), (2, 7)])
-def test_minutes_below_at_are_not_added_up_over_a_night(stop: int, after: int) -> None:
-    """T_Q is below AT for 10 of 15 min, the service is stopped, and it is below AT again; a stop costs its time."""
-    compensation = Compensation(checked(), QUILL)
-    values = {"t_q_degc": 20.0, "at_degc": 20.0, "y_um": math.nan, "heat_w": 0.0}
-    compensation.process(sample(0, values))
-    outcomes = []
-    for i in range(1, 11):
+@pytest.mark.parametrize(
+    ("suspect_jumps", "stop", "after"), [(True, 720, 15), (True, 2, 7), (False, 720, 5), (False, 2, 5)]
+)
+def test_minutes_below_at_are_not_added_up_over_a_night(suspect_jumps: bool, stop: int, after: int) -> None:
+    """T_Q is below AT for 10 of 15 min, the service is stopped, and it is below AT again; a stop costs its time.
+
+    Without `suspect_jumps` it costs none: so it was in 0.1.0, whose recordings are replayed to the bit.
+    """
+    guards = {"t_q_below_at_max_k": 2.0, "suspect_jumps": suspect_jumps}
+    compensation, outcomes = Compensation(checked(guards=guards), QUILL), list[Outcome]()
+    values = {"t_q_degc": 20.0, "y_um": math.nan, "heat_w": 0.0}
+    for i in range(10):
         compensation.process(sample(i, values | {"at_degc": 23.0 + 0.01 * i}))
     compensation.pause(stop)
     for i in range(20):
-        outcomes.append(compensation.process(sample(11 + stop + i, values | {"at_degc": 23.0 - 0.01 * i})))
+        outcomes.append(compensation.process(sample(10 + stop + i, values | {"at_degc": 23.1 - 0.01 * i})))
     assert first_at(outcomes, "t_q_at_exchanged") == after - 1
 
 

@@ -250,8 +250,9 @@ class PlausibilityCheck:
     def pass_time(self, samples: int) -> None:
         """Account for samples that were not measured."""
         self.state.rest_min = 0.0
-        # A restart of minutes hides no exchange; that of a night says nothing of the evening before.
-        self.state.below_min = max(self.state.below_min - samples * self._period_min, 0.0)
+        if self._watches_jumps:
+            # A restart of minutes hides no exchange; that of a night says nothing of the evening before.
+            self.state.below_min = max(self.state.below_min - samples * self._period_min, 0.0)
         if self._watched:
             nothing = SensorEvidence(below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN)
             for _ in range(min(samples, WINDOW * BLOCK_SAMPLES)):
