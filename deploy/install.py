@@ -225,11 +225,12 @@ class Installation:
             if given is None:
                 continue
             place = os.path.normpath(Path(CONFIGURATIONS) / name / given)
-            if not place.startswith(f"{RECORDINGS}/{name}/"):
-                raise InstallError(
-                    f"{config}: {kind}.{key} = {given!r}, expected a place below {RECORDINGS}/{name}/, the only one "
-                    "that the service may write to"
-                )
+            if place.startswith(f"{RECORDINGS}/{name}/"):
+                continue
+            expected = f"{config}: {kind}.{key} = {given!r}, expected a place below {RECORDINGS}/{name}/, the only one"
+            if key == "folder" or f"{place}/".startswith((f"{CONFIGURATIONS}/", f"{RECORDINGS}/")):
+                raise InstallError(f"{expected} that the service may write to")
+            report(f"{expected} that the service may write to unless its unit has ReadWritePaths (systemctl edit)")
         report(f"{config}: valid for {version.name}")
 
     def activate(self, version: Path, system: System, *, journal_limits: bool = False) -> None:

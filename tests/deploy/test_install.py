@@ -314,11 +314,11 @@ def test_the_configuration_of_another_machine_is_refused_and_not_copied(pc: Pc) 
         ('[model]\nstore = "/var/lib/compensator/vmc-07/models"', None),
         ('recording.head = "vmc-07.head.json"', "recording.head = 'vmc-07.head.json', expected a place"),
         ('recording.head = "/var/lib/compensator/vmc-07/vmc-07.head.json"', None),
+        ('recording.head = "/srv/heads/vmc-07.head.json"', None),
         *(
             (f'{key} = "{place}"', f"{key} = '{place}', expected a place")
             for key in ("recording.head", "model.store")
             for place in (
-                "/srv/vmc-07",
                 "/etc/compensator",
                 "/etc/compensator/../compensator/vmc-07/x",
                 "/var/lib/compensator/vmc-08/x",
