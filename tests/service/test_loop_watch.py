@@ -428,6 +428,13 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
     adoption = Adoption(config, tmp_path, store, events, files, clock=Mock(), running=lambda: present, loop=loop)
     adoption.begin("back", ModelRequest(), reply, Mock(data=dict))
     assert "No space left on device" in reply.result(timeout=0)["text"]
+    # Where it has ended otherwise, neither another exchange nor a later way back waits for that.
+    core.state.exchange = "adopt"
+    assert loop.waits_for == ""
+    core.state.exchange = ""
+    loop.hand_over(present)
+    core.state.exchange = "back"
+    assert loop.waits_for == ""
     monkeypatch.setattr(model_store, "replace_file", works)
     assert await sample() is before
     assert store.in_use() == QUILL and core.state.phase == "idle" and core.state.exchange == ""

@@ -112,13 +112,18 @@ class LiveLoop:
         self._found: Found | None = None
         self._warming: Found | None = None
         self._storing = Storing(parts.store, clock)
-        #: Why a decided way back has not happened yet; empty while nothing keeps it.
-        self.waits_for = ""
+        #: Why the last way back that was decided was not stored; empty if it was, or another one may be decided.
+        self._back_waits_for = ""
 
     @property
     def is_exchanging(self) -> bool:
         """Whether a decided exchange has not happened yet: another change of the model has to wait."""
         return self._core is not None and bool(self._core.state.exchange)
+
+    @property
+    def waits_for(self) -> str:
+        """Why a decided way back has not happened yet; empty if there is none, or nothing keeps it."""
+        return self._back_waits_for if self._core is not None and self._core.state.exchange == "back" else ""
 
     @property
     def is_working(self) -> bool:
@@ -155,7 +160,7 @@ class LiveLoop:
             return
         new, self._model, notes = core.exchange(present, self._model, present.status.time_utc_ns)
         in_force.append(new)
-        self._storing.is_done, self.waits_for = False, ""
+        self._storing.is_done, self._back_waits_for = False, ""
         self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._note(notes)
@@ -176,6 +181,8 @@ class LiveLoop:
         self._guarded(lambda core: self._hand_over(core, present.status.time_utc_ns), None)
 
     def _hand_over(self, core: ModelLoop, now_ns: int) -> None:
+        if core.state.exchange != "back":
+            self._back_waits_for = ""
         found, self._found = self._found, None
         # Where a defect ended a diagnosis, another one may have begun meanwhile.
         if found is not None and found.wanted == core.loop.wanted:
@@ -378,7 +385,7 @@ class LiveLoop:
             self._task.cancel()
         self._task = self._found = self._warming = None
         self._storing.cancel()
-        self.waits_for = ""
+        self._back_waits_for = ""
 
     def _give_up(self, core: ModelLoop, why: str) -> None:
         """End everything in shadow."""
@@ -397,10 +404,10 @@ class LiveLoop:
         incoming = core.incoming
         if incoming is None or core.state.exchange == "back":
             # The way back stays open: the model is stored again with the next sample.
-            if incoming is not None and why != self.waits_for:
+            if incoming is not None and why != self._back_waits_for:
                 text = f"the way back waits: {why}; it is tried again with each sample"
                 self._events.note(EventKind.ADOPT, text, {"ok": False, "action": "back", "by": "loop"})
-                self.waits_for = why
+                self._back_waits_for = why
             return
         self._end_one(
             core, incoming.compensation.model.sha256, f"{why}; the present one stays, and it is compared no more"
