@@ -107,6 +107,8 @@ def to_do(event: Event, config: str = CONFIG) -> str:
     if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
         yes, no = loop_commands(str(event.data.get("model_sha256", "")), config)
         return f"Answer with `{yes}` or `{no}`."
+    if event.kind == EventKind.ADOPT and event.data.get("by") == "loop":
+        return "Check free space, permissions and the disk; the adopted model remains active until then."
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""

@@ -25,3 +25,12 @@ def test_an_event_with_several_suspects_sends_nobody_to_a_healthy_sensor() -> No
     )
     both = state("implausible:at_degc", "implausible:t_q_degc", "t_q_missing")
     assert both.startswith("Measure the part;") and both.count("Measure the part") == 1 and "thermocouple" in both
+
+
+def test_a_way_back_that_waits_for_the_disk_is_no_model_that_was_refused() -> None:
+    def said(**more: str) -> str:
+        data = {"ok": False, "action": "back", **more}
+        return to_do(Event(schema=SCHEMA, machine="m", seq=1, time_utc_ns=1, kind="adopt", text="", data=data))
+
+    assert "disk" in said(by="loop") and "refused" not in said(by="loop")
+    assert "refused" in said()
