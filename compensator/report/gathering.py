@@ -171,8 +171,12 @@ class _Reader:
         shares = {"DTF": number(estimate.y_dtf_um), "TDTF": number(estimate.y_tdtf_um)}
         for i, value in enumerate(estimate.y_effects_um):
             shares[self._effects[i] if i < len(self._effects) else f"effect {i + 1}"] = value
-        if estimate.y_base_um or "share at the zero" in self._buffers:
-            shares["at the zero"] = -estimate.y_base_um
+        level_um = estimate.level_um or 0.0
+        at_zero_um = estimate.y_base_um + level_um
+        if at_zero_um or "share at the zero" in self._buffers:
+            shares["at the zero"] = -at_zero_um
+        if level_um or "share level" in self._buffers:
+            shares["level"] = level_um
         if self.history.probes_count:
             # Zero before the first probe taken; the prediction is the sum of all shares.
             modelled = (number(estimate.y_dtf_um), number(estimate.y_tdtf_um), *estimate.y_effects_um)

@@ -466,8 +466,11 @@ class WatchedMachine:
             return {**dict.fromkeys(_ESTIMATE), "shares": []}
         effects = [(name, value) for name, value in zip(self.effects(), estimate.y_effects_um, strict=False)]
         parts = [("DTF", estimate.y_dtf_um), ("TDTF", estimate.y_tdtf_um), *effects]
-        # The prediction at the zero is subtracted from the sum.
-        parts += [("at the zero", -estimate.y_base_um)] if estimate.y_base_um else []
+        # The prediction at the zero is subtracted from the sum; a level that was raised since is added.
+        level_um = estimate.level_um or 0.0
+        at_zero_um = estimate.y_base_um + level_um
+        parts += [("at the zero", -at_zero_um)] if at_zero_um else []
+        parts += [("level", level_um)] if level_um else []
         if self._status is not None and not isinstance(self._status.probe_wanted, UnsetType):
             shown = [value for _, value in parts if value is not None]
             parts += [("probes", estimate.y_pred_um - math.fsum(shown))] if estimate.y_pred_um is not None else []

@@ -159,13 +159,15 @@ def test_two_effects_of_one_kind_have_a_share_each_and_the_probes_what_is_theirs
     contents: Any = SimpleNamespace(metadata={}, attachments={"model.toml": SimpleNamespace(data=table.encode())})
     reader._opening(contents)
     reader.history.probes_count = 1
-    values = {"y_dtf_um": 10.0, "y_tdtf_um": 1.0, "y_effects_um": [4.0, 3.0], "y_base_um": 2.0, "y_pred_um": 16.5}
+    values = {"y_dtf_um": 10.0, "y_tdtf_um": 1.0, "y_effects_um": [4.0, 3.0]}
+    values |= {"y_base_um": 2.0 - 3.5, "level_um": 3.5, "y_pred_um": 20.0}
     missing = dict.fromkeys(("y_um", "residual_um", "heat_w"))
     estimate: Any = SimpleNamespace(time_utc_ns=START_NS, seq=1, **values, **missing)
     reader._estimate(estimate)
     shares = {name: value for name, (_, (value,)) in reader._buffers.items() if name.startswith("share ")}
     assert shares["share input oil_degc"] == 4.0 and shares["share input oil_degc 2"] == 3.0
-    assert shares["share probes"] == pytest.approx(0.5) and sum(shares.values()) == pytest.approx(16.5)
+    assert shares["share at the zero"] == -2.0 and shares["share level"] == 3.5
+    assert shares["share probes"] == pytest.approx(0.5) and sum(shares.values()) == pytest.approx(20.0)
 
 
 def test_an_episode_over_a_clock_that_was_set_back_has_its_length() -> None:

@@ -589,3 +589,10 @@ def test_the_prediction_of_the_shadow_is_in_the_history_of_its_sample() -> None:
     for number in (5, 7):  # the other one is of a sample that did not arrive
         history.add_candidate(msgspec.json.decode(status(number, loop=LOOP), type=Status))
     assert history.columns()["candidate_um"] == [11.0]
+
+
+def test_a_level_that_was_raised_is_no_share_at_the_zero(heard: Heard) -> None:
+    heard.hear(offset=offset(5), estimate=estimate(5, y_base_um=-6.0, level_um=6.0))
+    assert heard.machine["shares"][-1] == {"name": "level", "y_um": 6.0} and len(heard.machine["shares"]) == 4
+    heard.hear(estimate=estimate(6, START_NS + 60 * NS, y_base_um=-4.0, level_um=6.0))
+    assert heard.machine["shares"][-2:] == [{"name": "at the zero", "y_um": -2.0}, {"name": "level", "y_um": 6.0}]
