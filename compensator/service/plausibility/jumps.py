@@ -176,8 +176,9 @@ class JumpWatch:
     def follow(self, engine: Engine, reasons: Sequence[str]) -> Judgement:
         """Use suspect channels again where the model in force has suspected them, too, and does no longer.
 
-        Probes during a hold have shown it there, or a person has said so. Channels that return, or are loose, are left
-        to this watch: what they showed was wrong.
+        Probes during a hold have shown it there, or a person has said so, or that model, measured Y or its hindsight
+        speaks for them. What a fault before the jump has left in the state stays there. Channels that return, or are
+        loose, are left to this watch: what they showed was wrong.
 
         Parameters
         ----------
