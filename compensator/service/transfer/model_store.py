@@ -25,15 +25,12 @@ _FILE = "adopted.json"
 
 
 class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """A change of the model: hash and name of the model from then on, time, command, and whether the loop did it.
-
-    Where an adoption has failed, and the model from before it goes on, the action is `failed`.
-    """
+    """A change of the model: hash and name of the model from then on, time, command, and whether the loop did it."""
 
     sha256: str
     name: str
     time_utc_ns: int
-    action: Literal["adopt", "back", "failed"] = "adopt"
+    action: Literal["adopt", "back"] = "adopt"
     by: Literal["loop"] | UnsetType = UNSET
 
 
@@ -153,7 +150,7 @@ class ModelStore:
             known = [one for one in history if (one.sha256, one.action) == (sha256, "adopt")]
             in_use.append(known[-1] if known else entry)
         by = in_use[-1].by if in_use else UNSET
-        history.append(msgspec.structs.replace(entry, action="failed" if was_adopted else "adopt", by=by))
+        history.append(msgspec.structs.replace(entry, action="back" if was_adopted else "adopt", by=by))
         self._write(contents)
 
     # ------------------------------------------------------------------ files
