@@ -599,7 +599,8 @@ class DataRemark(Code):
         "zeros_left_out",
         "A zero was set between probes; from there a feature counts anew, so only those about one zero are used; by a "
         "diagnosis all but those that are alone about theirs.",
-        "Export the recordings of each zero to a table of their own: each table has a zero of its own.",
+        "To identify a model, export the recordings of each zero to a table of their own: each table has a zero of its "
+        "own. For a diagnosis, probe at least twice about each zero.",
     )
     SEVERAL_ZEROS = (
         "several_zeros",
