@@ -212,14 +212,13 @@ class WatchedFolder:
             self._refuse(path, ProbeSourceRemark.ROW_BROKEN, lines[0], str(bad))
             return
         old = 0
-        ahead = len(self._ahead)
         for line in lines[1:]:
             old += self._handle(path, names, line)
             yield
         if old:
             why = f"{old} line(s) older than {duration(self._send_within_ns / 1e9)}"
             self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
-        if len(self._ahead) > ahead:
+        if any(one.path == path for one in self._ahead.values()):
             why = "line(s) ahead of this computer's clock, not sent before it is set"
             self._refuse(path, ProbeSourceRemark.LINE_AHEAD, "", why)
 
