@@ -24,6 +24,18 @@ Indices = npt.NDArray[np.int_]
 ComplexVector = npt.NDArray[np.complex128]
 
 
+def stretches_of(mask: Mask) -> list[tuple[int, int]]:
+    """Return the first and past last sample of each stretch of a mask.
+
+    Examples
+    --------
+    >>> stretches_of(np.array([True, False, True, True]))
+    [(0, 1), (2, 4)]
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(int), [0])))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
 def rms_of(values: Vector) -> float:
     """Return the root mean square of the values that are not missing.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from compensator.arrays import Indices, Mask, Vector
+from compensator.arrays import Indices, Mask, Vector, stretches_of
 from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
 from compensator.data.runs import is_sparse, noise_std
@@ -337,8 +337,7 @@ def stand_at_limit(values: Vector) -> Stand | None:
 def _stands(v: Vector, limit: float) -> tuple[Mask, list[tuple[int, int]]]:
     """Return where a signal is at a limit, and first and past last sample of each time that it stands there."""
     at = np.abs(v - limit) <= SAME * max(1.0, abs(limit))
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0])))).tolist()
-    return at, [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STAND_SAMPLES]
+    return at, [(a, b) for a, b in stretches_of(at) if b - a >= STAND_SAMPLES]
 
 
 def _is_lively(v: Vector, at: Mask) -> bool:

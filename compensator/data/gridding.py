@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from compensator.arrays import LARGEST, Indices, Mask, Vector
+from compensator.arrays import LARGEST, Indices, Mask, Vector, stretches_of
 from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, TEMPERATURES, SampledData, SampledRecord
 from compensator.data.runs import is_sparse
@@ -89,7 +89,7 @@ def to_grid(table: Table, period_s: float, *, whole_y: bool = False) -> SampledD
     present[slot] = True
     apart_s = _spacing(t_s) if t_s.size > 1 else 0.0
     usual = math.ceil(apart_s / period_s - 0.01) - 1
-    gaps = [(first, last) for first, last in _gaps(present) if last - first > usual]
+    gaps = [(first, last) for first, last in stretches_of(~present) if last - first > usual]
     if usual > 0:
         words = f"{table.name}: its rows are {apart_s:.0f} s apart, samples {period_s:g} s; bridged."
         remarks.append(Remark(DataRemark.ROWS_APART, words))
@@ -105,7 +105,7 @@ def to_grid(table: Table, period_s: float, *, whole_y: bool = False) -> SampledD
     for a, b in records:
         inside[a:b] = True
     remarks += _bridged(table.name, [one for one in gaps if inside[one[0]]], period_s)
-    for first, last in _gaps(inside):
+    for first, last in stretches_of(~inside):
         # What is only one temperature's is said of it.
         if not any(mask[first:last].all() for mask in empty.values()):
             gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
@@ -143,7 +143,7 @@ def _between_long_gaps(known: Mask) -> list[tuple[int, int]]:
     """Return the first and past last sample of each stretch between long gaps; short ones stay, at the ends, too."""
     if not known.any():
         return []
-    long = [gap for gap in _gaps(known) if gap[1] - gap[0] > SHORT_GAP_SAMPLES]
+    long = [gap for gap in stretches_of(~known) if gap[1] - gap[0] > SHORT_GAP_SAMPLES]
     edges = [0, *(edge for gap in long for edge in gap), known.size]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
 
@@ -159,7 +159,7 @@ def _short_holes(name: str, empty: Mapping[str, Mask], period_s: float) -> Itera
 def _long(mask: Mask) -> Mask:
     """Return the samples of a mask that are in stretches longer than what is bridged."""
     long = np.zeros(mask.size, dtype=bool)
-    for first, last in _gaps(~mask):
+    for first, last in stretches_of(mask):
         long[first:last] = last - first > SHORT_GAP_SAMPLES
     return long
 
@@ -167,7 +167,7 @@ def _long(mask: Mask) -> Mask:
 def _missing_inputs(name: str, empty: Mapping[str, Mask], inside: Mask, period_s: float) -> Iterator[Remark]:
     """Yield a remark on each temperature that is missing for longer than what is bridged."""
     for column, mask in empty.items():
-        long = [(first, last) for first, last in _gaps(~mask) if last - first > SHORT_GAP_SAMPLES]
+        long = [(first, last) for first, last in stretches_of(mask) if last - first > SHORT_GAP_SAMPLES]
         if long:
             hours = sum(last - first for first, last in long) * period_s / 3600.0
             where = ", ".join(f"{first * period_s:g}" for first, _ in long[:_SHOWN])
@@ -312,8 +312,3 @@ def _mean_by_slot(slot: Indices, values: Vector, n: int) -> Vector:
     mean = np.full(n, np.nan)
     mean[count > 0] = total[count > 0] / count[count > 0]
     return mean
-
-
-def _gaps(present: Mask) -> list[tuple[int, int]]:
-    edges = np.diff(np.concatenate(([1], present.astype(int), [1])))
-    return list(zip(np.flatnonzero(edges == -1).tolist(), np.flatnonzero(edges == 1).tolist(), strict=True))

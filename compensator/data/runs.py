@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Indices, Mask, Vector
+from compensator.arrays import Indices, Mask, Vector, stretches_of
 from compensator.data.record import SHORT_GAP_SAMPLES, TEMPERATURES, SampledRecord
 
 #: Longest stretch at the start of a run whose mean is its reference, samples.
@@ -130,8 +130,7 @@ class Run:
             values = self.channels[name]
             known = at[~missing]
             bridged[name] = np.interp(at, known, values[known]) if known.size else np.zeros(at.size)
-            edges = np.flatnonzero(np.diff(np.concatenate(([0], missing, [0]))))
-            holes |= set(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+            holes |= set(stretches_of(missing))
         own = dataclasses.replace(self, channels=bridged, holes=tuple(sorted(holes)))
         return own.with_zeros(own.zeros_s)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Vector, stretches_of
 from compensator.data.runs import Run, is_noise, noise_std
 from compensator.errors import DataError, UsageError
 
@@ -193,12 +193,9 @@ def _check_possible(run: Run, column: str, values: Vector) -> None:
 def dead_part(values: Vector) -> slice | None:
     """Return the longest stretch of a sensor that is noisy and then constant for an hour or more; None without one."""
     steps = np.diff(values)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], (steps == 0.0).astype(int), [0]))))
-    if edges.size == 0:
+    first, last = max(stretches_of(steps == 0.0), key=lambda one: one[1] - one[0], default=(0, 0))
+    if first == last:
         return None
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    first, last = int(starts[longest]), int(ends[longest])
     others = np.concatenate((steps[:first], steps[last:]))
     others = others[np.isfinite(others)]
     # Computed data is constant at rest before its start.
