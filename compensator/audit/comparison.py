@@ -111,31 +111,6 @@ class Comparison:
     axes: dict[str, AxisComparison] = field(default_factory=dict)
     only_y: str = ""
 
-    @property
-    def residual_before(self) -> Spread:
-        """Measured − predicted Y of the recorded model."""
-        return self.own.residual_before
-
-    @property
-    def residual_after(self) -> Spread:
-        """Measured − predicted Y of the other model."""
-        return self.own.residual_after
-
-    @property
-    def left_before(self) -> Spread:
-        """Remaining error of Y with the recorded model."""
-        return self.own.left_before
-
-    @property
-    def left_after(self) -> Spread:
-        """Remaining error of Y with the other model."""
-        return self.own.left_after
-
-    @property
-    def offsets(self) -> Spread:
-        """The other offset of Y − the recorded one."""
-        return self.own.offsets
-
     def as_json(self) -> dict[str, Any]:
         """Return the result for `--json`."""
         return {
@@ -163,7 +138,7 @@ class Comparison:
         rows = self.rows()
         width = max(map(len, rows))
         lines = [
-            f"{self.samples} samples; {self.residual_before.samples} of them have a residual with both models",
+            f"{self.samples} samples; {self.own.residual_before.samples} of them have a residual with both models",
             f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at",
         ]
         for name, spread in rows.items():

@@ -295,10 +295,10 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
         clock=True,
         x_limits=ends,
         lines=(curves.line(recorded, "recorded"), curves.line(other, "other")),
-        note=f"They differ by {_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
+        note=f"They differ by {_um(found.own.offsets.rms)} µm rms, at most {_um(abs(found.own.offsets.peak))} µm.",
     )
     blocks: list[Block] = [offsets]
-    if found.left_before.samples:
+    if found.own.left_before.samples:
         left = (curves.line(recorded, "left recorded"), curves.line(other, "left other"))
         blocks.append(
             Figure(
@@ -321,11 +321,11 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
 
 
 def _better(found: Comparison) -> tuple[str, Tone]:
-    before, after = found.left_before.rms, found.left_after.rms
-    if not found.left_before.samples:
+    before, after = found.own.left_before.rms, found.own.left_after.rms
+    if not found.own.left_before.samples:
         return (
             f"Y was not measured, so it is unknown which model is better: the offset of “{found.other}” differs by "
-            f"{_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
+            f"{_um(found.own.offsets.rms)} µm rms, at most {_um(abs(found.own.offsets.peak))} µm.",
             "warn",
         )
     words = (

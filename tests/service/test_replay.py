@@ -34,7 +34,7 @@ def free_run_differs_um(machine: Machine) -> float:
     """Run the recorded model over all recordings as another model would be; largest difference of an offset, µm."""
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
     assert found.samples == len(machine.outcomes) and not found.remarks
-    return abs(found.offsets.peak)
+    return abs(found.own.offsets.peak)
 
 
 @pytest.mark.parametrize("by_s", [3600.0, -3600.0, 86_400.0])
@@ -74,7 +74,7 @@ async def test_a_torn_last_sample_counts_and_its_offset_does_not(tmp_path: Path)
     first = [step for step in steps_of(recordings(machine.recordings, MACHINE)[0]) if step.sample is not None]
     assert len(first) == 60 and "offset" not in first[-1].records
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
-    assert found.samples == 89 and found.offsets.peak == 0.0
+    assert found.samples == 89 and found.own.offsets.peak == 0.0
 
 
 async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Pa
     after = [outcome.offset for outcome in machine.outcomes[-30:]]
     assert all("internal_error" in offset.reasons and number(offset.y_offset_um) == at_end for offset in after)
     assert not any("are not reproduced" in event.text for event in machine.events("restart"))
-    assert compare(recordings(machine.recordings, MACHINE), MODEL).offsets.peak == 0.0
+    assert compare(recordings(machine.recordings, MACHINE), MODEL).own.offsets.peak == 0.0
 
 
 async def test_where_files_between_were_not_given_their_time_is_the_pause(tmp_path: Path) -> None:
@@ -140,4 +140,4 @@ async def test_a_start_whose_first_sample_failed_keeps_its_pause(tmp_path: Path,
     await machine.run(120)
     assert not defects
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
-    assert abs(found.offsets.peak) == 0.0 and machine.offsets()[-1] != machine.offsets()[64]
+    assert abs(found.own.offsets.peak) == 0.0 and machine.offsets()[-1] != machine.offsets()[64]
