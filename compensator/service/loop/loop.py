@@ -24,7 +24,6 @@ from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero, is_constant
-from compensator.service.loop.misfit import count_misfit
 from compensator.service.loop.place import (
     falls,
     gives_way,
@@ -33,7 +32,7 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.schedule import begin_again, begin_if_due, errs, pass_planned
+from compensator.service.loop.schedule import begin_again, begin_if_due, count_misfit, errs, pass_planned
 from compensator.service.loop.state import LoopState, Place, Role, Running, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
