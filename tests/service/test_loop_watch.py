@@ -278,7 +278,7 @@ def begun() -> tuple[Loop, int]:
     [
         (lambda loop, now_ns: gone_back(loop, now_ns), "replaced"),
         (lambda loop, now_ns: loop.restarted(), "interrupted"),
-        (lambda loop, now_ns: loop.give_up_one("", "failed", "no memory"), "failed"),
+        (lambda loop, now_ns: loop.give_up_one("", "no memory"), "failed"),
         (lambda loop, now_ns: loop.model_changed([], now_ns, calibrated=[]), "by_hand"),
     ],
 )

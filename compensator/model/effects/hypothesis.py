@@ -249,10 +249,10 @@ class Context:
         tau = self.tau("surface_min")
         return dataclasses.replace(tau, grid=tau.grid[2::3], key="")
 
-    def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
+    def tau(self, name: str = "tau_min") -> Free:
         """Return a time constant, from a sample to a third of the record."""
         high = max(self.minutes / 3.0, 10.0 * self.period_min)
-        low = low * self.period_min
+        low = 0.6 * self.period_min
         grid = tuple(float(t) for t in np.geomspace(low, high, 12))
         return Free(name=name, low=low, high=high, grid=grid, key="tau_min")
 

@@ -396,7 +396,7 @@ class LiveLoop:
     def _end_one(self, core: ModelLoop, sha256: str, why: str) -> None:
         """End a candidate: that in shadow, or one whose warm-up has failed."""
         self._warming = None
-        ended = core.loop.give_up_one(sha256, FAILED_OUTSIDE, why)
+        ended = core.loop.give_up_one(sha256, why)
         self._note(ended or [_failed(why)])
 
     def _end_not_stored(self, core: ModelLoop) -> None:

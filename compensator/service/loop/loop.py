@@ -21,7 +21,7 @@ from compensator.events import DiagnosisData, LoopAction, Note
 from compensator.service.loop.avoided import avoid
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
-from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
+from compensator.service.loop.ending import FAILED_OUTSIDE, end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero, is_constant
 from compensator.service.loop.place import (
@@ -420,11 +420,11 @@ class Loop:
         notes = [note for place in self.state.taken for note in end(self.state, place, why, text)]
         return notes + end_diagnosis(self.state, why, text)
 
-    def give_up_one(self, sha256: str, why: str, text: str) -> list[Note]:
+    def give_up_one(self, sha256: str, text: str) -> list[Note]:
         """End a diagnosis, and the shadow with this hash if there is one, for a cause outside of the loop."""
         place = self.state.place(sha256)
-        notes = end(self.state, place, why, text) if place is not None else []
-        return notes + end_diagnosis(self.state, why, text)
+        notes = end(self.state, place, FAILED_OUTSIDE, text) if place is not None else []
+        return notes + end_diagnosis(self.state, FAILED_OUTSIDE, text)
 
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""

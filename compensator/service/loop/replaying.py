@@ -58,7 +58,7 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
             # When a warm-up ends is an input, as a diagnosis is: what follows from it has not begun yet.
             return core.loop.begin()
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
-            core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
+            core.loop.give_up_one(data.model_sha256, event.text)
     return []
 
 
