@@ -184,7 +184,7 @@ class Probe(_Table, frozen=True, kw_only=True):
     match_um: Micrometres = 1.0
 
 
-class Loop(_Table, frozen=True, kw_only=True):
+class LoopSettings(_Table, frozen=True, kw_only=True):
     """`[loop]`: the service looks for what its model lacks; without this table it does not.
 
     `policy`: `propose` asks a person before a better model is adopted, `adopt` adopts it. `at_utc`, `every_h`: a
@@ -310,7 +310,7 @@ class Config(_Table, frozen=True, kw_only=True):
     restart: Restart = Restart()
     plausibility: Plausibility | None = None
     probe: Probe | None = None
-    loop: Loop | None = None
+    loop: LoopSettings | None = None
     axis: Axes | None = None
 
 

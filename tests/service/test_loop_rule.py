@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import Place
 from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block, ComparisonState
 from compensator.service.transfer.evidence import evidence
@@ -54,7 +54,7 @@ def test_a_candidate_that_is_neither_better_nor_worse_is_refused_more_often_than
 
 def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> None:
     night = Night(shown(extended(2.0)), shown(extended()))
-    loop = LoopRun(settings(**SHORT), QUILL, night)
+    loop = OfflineLoop(settings(**SHORT), QUILL, night)
     steps = run(loop, machine(2 * DAY, noise_um=NOISY_UM))
     found = [decision for decision in decisions(steps) if decision[1] in ("shadow", "adopt")]
     assert [step for _, step, _ in found] == ["shadow", "shadow", "adopt"]
@@ -67,7 +67,7 @@ def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> No
 
 
 def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None:
-    loop = LoopRun(settings(**SHORT), QUILL, Night(shown(extended()), shown(extended(7.0))))
+    loop = OfflineLoop(settings(**SHORT), QUILL, Night(shown(extended()), shown(extended(7.0))))
     steps = run(loop, machine(DAY + 600, noise_um=NOISY_UM))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 

@@ -31,7 +31,7 @@ from compensator.recording.reading import RawRecord, groups_of, messages, record
 from compensator.service.event_log import EventLog
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.process import DiagnosisProcess
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
@@ -615,11 +615,11 @@ async def test_a_loop_of_a_shop_decides_by_the_settings_of_a_table_that_is_off(
     await machine.run(5)
     used: list[Config] = []
 
-    def seen(config: Config, *others: Any) -> LoopRun:
+    def seen(config: Config, *others: Any) -> OfflineLoop:
         used.append(config)
-        return LoopRun(config, *others)
+        return OfflineLoop(config, *others)
 
-    monkeypatch.setattr(shop, "LoopRun", seen)
+    monkeypatch.setattr(shop, "OfflineLoop", seen)
     assert not shop.loop_of_machine(machine.recordings, "propose").error
     assert machine.config.loop is not None
     assert [one.loop for one in used] == [msgspec.structs.replace(machine.config.loop, policy="propose")]

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from compensator.clock import HOUR_NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.place import is_asked, leads
@@ -27,7 +27,7 @@ class Choice:
     ----------
     state : LoopState
         State of the loop.
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     compared : callable
         Returns what is compared of a model in shadow and the present one.

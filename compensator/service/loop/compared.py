@@ -10,7 +10,7 @@ import numpy as np
 from compensator.arrays import rms_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.diagnose.change import QUIET
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
@@ -42,7 +42,7 @@ class Compared:
     ----------
     place : Place
         The place; its comparison and verdict are kept up to date.
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     period_s : float
         Length of a sample, s.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import Note
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from compensator.clock import HOUR_NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART, CANDIDATES

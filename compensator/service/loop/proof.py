@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
 
 #: A candidate must be wrong by less than this part of what the present model is wrong by.

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from compensator.clock import HOUR_NS, NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import EventKind, LoopAction, LoopData, Note
 from compensator.messages import number
 from compensator.service.loop.avoided import is_avoided

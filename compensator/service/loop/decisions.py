@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from compensator.clock import HOUR_NS, NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.diagnose.change import BLOCK_MIN
 from compensator.errors import ServiceError
 from compensator.events import DiagnosisData, LoopAction, Note
@@ -54,12 +54,12 @@ CLEAN_MIN = BLOCK_MIN
 _SEEN = 0.25
 
 
-class Loop:
+class LoopDecisions:
     """Decides about the models of one machine.
 
     Parameters
     ----------
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     period_s : float
         Length of a sample, s.
