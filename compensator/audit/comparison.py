@@ -25,7 +25,7 @@ from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import in_order
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_until_damage
+from compensator.service.replay import ForeignRun, RecordedStep, setup_of, steps_until_damage
 from compensator.service.status import Zero
 
 #: Columns of the table of both offsets.
@@ -213,7 +213,7 @@ class _Run:
         data: bytes,
     ) -> None:
         self._model, self._row, self._point, self._data = model, row, point, data
-        self._free: FreeRun | None = None
+        self._foreign: ForeignRun | None = None
         #: Configuration and model of the present file, and names of the recorded models.
         self._config = self._recorded = b""
         self._names: dict[str, None] = {}
@@ -222,7 +222,7 @@ class _Run:
     def add(self, step: RecordedStep, contents: Contents) -> None:
         """Run one group."""
         estimate, offset = step.estimate, step.offset
-        if self._free is None and (step.sample is None or estimate is None):
+        if self._foreign is None and (step.sample is None or estimate is None):
             return
         result = self._ready(step, contents, estimate).run(step)
         if isinstance(result, Outcome) and estimate is not None and offset is not None:
@@ -239,24 +239,24 @@ class _Run:
         """Add a remark on the validity of the figures."""
         self._result.remarks.append(Remark(code, figures))
 
-    def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
+    def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> ForeignRun:
         """Return the run with the other model and the configuration of the file."""
         parts = [contents.attachments.get(name) for name in ("config.toml", "model.toml")]
         data, model = (part.data if part else b"" for part in parts)
-        if self._free is not None and (data, model) == (self._config, self._recorded):
-            return self._free
+        if self._foreign is not None and (data, model) == (self._config, self._recorded):
+            return self._foreign
         config, recorded = setup_of(contents, step.file)
         self._names[recorded.name], self._recorded = None, model
-        if self._free is not None and data == self._config:
-            return self._free
+        if self._foreign is not None and data == self._config:
+            return self._foreign
         try:
-            self._free = FreeRun(self._other(config))
+            self._foreign = ForeignRun(self._other(config))
         except ServiceError as error:
             raise DataError(f"{error} in the recording") from error
         self._config = data
         if estimate is not None:
-            self._begin(self._free.compensation, step, estimate)
-        return self._free
+            self._begin(self._foreign.compensation, step, estimate)
+        return self._foreign
 
     def _other(self, config: Config) -> Compensation:
         """Return a compensation with the other model: of all axes, if it has their parts, else of Y alone."""

@@ -11,8 +11,8 @@ from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
 from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.jump_engines import (
+    EngineRun,
     JumpEngines,
-    Run,
     contradicts,
     expected_value,
     is_unsteady,
@@ -228,7 +228,7 @@ class JumpJudge:
         state.start_evidence()
         return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
 
-    def _accept(self, run: Run | None, how: str) -> Verdict:
+    def _accept(self, run: EngineRun | None, how: str) -> Verdict:
         engines, state, offered = self._engines, self._state, self._offered
         names = list(state.jumps)
         notes = [accepted_note(name, state.jumps[name].size_k, how) for name in names]
