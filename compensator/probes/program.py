@@ -13,7 +13,7 @@ from compensator.probes.handled import Handled
 from compensator.probes.linuxcnc import ProbeFile
 from compensator.probes.printed import PrintedProbes
 from compensator.probes.probe import Probe, ProbeSink
-from compensator.probes.sender import Sender
+from compensator.probes.sender import ProbeQueue
 from compensator.probes.settings import ProbeSettings
 from compensator.probes.stream import Stream
 from compensator.receiver.applied_record import applied_at
@@ -41,7 +41,7 @@ async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event) -
         If the state file cannot be read.
     """
     service = settings.service
-    sender = Sender(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=log.info)
+    sender = ProbeQueue(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=log.info)
 
     def applied(time_utc_ns: int) -> float | None:
         return applied_at(Path(service.applied_file), time_utc_ns) if service.applied_file else None
