@@ -19,7 +19,7 @@ import numpy as np
 from compensator.api.loop_diagnosis import diagnosis_in_process
 from compensator.arrays import Vector
 from compensator.clock import NS
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import in_parallel
 from compensator.config import Channel, Config, LoopSettings, Plausibility, parse_config
 from compensator.demo.calibration import PERIOD_S, calibrate

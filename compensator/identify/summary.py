@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.identify.calibration import Calibration
-from compensator.identify.comparison import Row
+from compensator.identify.coefficients import Row
 from compensator.identify.criticism import Criticism
 from compensator.model.free_run import NOTHING, FreeRunErrors, in_words, table_of
 from compensator.model.simulation import SCORE_HEAD

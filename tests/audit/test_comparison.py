@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import COLUMNS, compare
+from compensator.audit.other_model import COLUMNS, compare
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.errors import DataError

@@ -9,7 +9,6 @@ import pytest
 from compensator.diagnose.advice import Unexplained, _sensor, advice_of, resembling
 from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.events import follows_day, goes_with, steepest, swings, switched
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
@@ -20,6 +19,7 @@ from compensator.diagnose.record_with_test import HOURS as HOURS_OF_TESTS
 from compensator.diagnose.record_with_test import expected_change
 from compensator.diagnose.series import series_of
 from compensator.diagnose.summary import contents, figures
+from compensator.diagnose.switched import follows_day, goes_with, steepest, swings, switched
 from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
 from compensator.diagnose.warning_words import warnings_on
 from compensator.display import Words

@@ -9,7 +9,6 @@ import compensator as tc
 from compensator.diagnose import diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.detection_limit import detection_limits
-from compensator.diagnose.events import HEAT
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
@@ -17,6 +16,7 @@ from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.record_with_test import HOURS, RecordWithTest
 from compensator.diagnose.search import Search
+from compensator.diagnose.switched import HEAT
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.whitening import Whitening
 from compensator.errors import DataError

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.cli import main
 from compensator.demo.calibration import write_table
 from compensator.diagnose.ceiling import ceiling, remainder

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import compare
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
+from compensator.audit.other_model import compare
 from compensator.cli import main
 from compensator.config import LoadedConfig, parse_config
 from compensator.errors import CompensatorError, ConfigError, ModelError, ServiceError

@@ -20,8 +20,8 @@ from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.state import Place, Role, decode_loop
 from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
-from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.two_models import BLOCK_NS
 
 #: A planned diagnosis is 8 h later.
 BEGIN_NS = 1_767_592_800 * NS

@@ -29,9 +29,9 @@ from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import NO_VERDICT, LoopState, Place, Running
 from compensator.service.loop.weighing import Diagnosed, without_candidate
 from compensator.service.replay import opening_of
-from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import second_opinion
+from compensator.service.transfer.two_models import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.warm_up import warm_up
 from tests.service.living import MACHINE
 from tests.service.looping import (

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from compensator.service.loop.place import LEADS
 from compensator.service.loop.run import LoopStep, OfflineLoop
-from compensator.service.transfer.comparison import DEVIATIONS
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.two_models import DEVIATIONS
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
 from tests.service.test_loop_run import CHECKED, NIGHT
 from tests.service.test_loop_service import Asked, Looping, checked, in_phase

@@ -11,9 +11,9 @@ from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import Place
-from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block, ComparisonState
-from compensator.service.transfer.evidence import evidence
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.refutation import evidence
+from compensator.service.transfer.two_models import BLOCK_NS, SURE_PART, Block, ComparisonState
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
 from tests.service.test_loop_watch import HOUR_NS, follows, watching
 from tests.service.test_restart import QUILL

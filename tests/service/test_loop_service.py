@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from compensator.api import shop
+from compensator.audit.machine_audit import audit, summary
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import Config, parse_config
 from compensator.events import ComparisonData, EventKind, NotJudged
@@ -38,9 +38,9 @@ from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import adoption, model_store
-from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.shadow import Shadow
+from compensator.service.transfer.two_models import not_judged
 from compensator.watch.history import STEP_NS, MachineHistory
 from compensator.watch.past import last_day
 from tests.audit.made import CONFIG

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from compensator.audit.comparison import compare
+from compensator.audit.other_model import compare
 from compensator.config import parse_config
 from compensator.messages import number
 from compensator.model.model_file import parse_model

@@ -31,8 +31,8 @@ from compensator.service.loop.state import NO_VERDICT, Place
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
-from compensator.service.transfer.comparison import FEWEST, Comparison, changed
 from compensator.service.transfer.second_opinion import is_unusable
+from compensator.service.transfer.two_models import FEWEST, Comparison, changed
 
 
 class Compared:

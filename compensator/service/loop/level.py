@@ -21,9 +21,9 @@ from compensator.diagnose.change import BLOCK_MIN, FEWEST, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero, sets_zero_at_rest
-from compensator.service.transfer.comparison import BLOCK_NS
-from compensator.service.transfer.evidence import FLOOR_UM
+from compensator.service.transfer.refutation import FLOOR_UM
 from compensator.service.transfer.second_opinion import is_unusable
+from compensator.service.transfer.two_models import BLOCK_NS
 
 #: The present model was right before if it erred by less than `QUIET` of what it errs by since then, and its error
 #: changed by less than this part of what the candidate's changed by.

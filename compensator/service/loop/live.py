@@ -30,9 +30,9 @@ from compensator.service.loop.process import Diagnose
 from compensator.service.loop.status import loop_status
 from compensator.service.loop.storing import Storing, calibrated_effects
 from compensator.service.loop.words import named
-from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.two_models import changed
 
 log = logging.getLogger("compensator")
 

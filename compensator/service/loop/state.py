@@ -12,7 +12,7 @@ from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.messages import UNREADABLE, check_numbers
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.transfer.comparison import ComparisonState, moved
+from compensator.service.transfer.two_models import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
 STATE_SCHEMA = 9

@@ -22,7 +22,7 @@ from compensator.messages import number
 from compensator.messages_axes import AxesEstimate
 from compensator.service.outcome import Outcome
 from compensator.service.probing import UNKNOWN_UM
-from compensator.service.transfer.evidence import evidence, followed
+from compensator.service.transfer.refutation import evidence, followed
 
 #: From this number of standard deviations on one of the models is refuted: by the likelihood (`evidence`).
 DEVIATIONS = 4.0

@@ -44,7 +44,7 @@ COLUMNS = (
 
 @dataclass(slots=True)
 class AxisComparison:
-    """Figures of a further axis that was measured, as those of Y in `Comparison`."""
+    """Figures of a further axis that was measured, as those of Y in `OtherModel`."""
 
     residual_before: Spread = field(default_factory=Spread)
     residual_after: Spread = field(default_factory=Spread)
@@ -83,7 +83,7 @@ class AxisComparison:
 
 
 @dataclass(slots=True)
-class Comparison:
+class OtherModel:
     """The recorded model compared with another one.
 
     Parameters
@@ -158,7 +158,7 @@ def compare(
     row: Callable[[Iterable[Any]], Any] | None = None,
     point: Callable[..., None] | None = None,
     data: bytes = b"",
-) -> Comparison:
+) -> OtherModel:
     """Run another model over recordings, in the order of their start.
 
     Parameters
@@ -217,7 +217,7 @@ class _Run:
         #: Configuration and model of the present file, and names of the recorded models.
         self._config = self._recorded = b""
         self._names: dict[str, None] = {}
-        self._result = Comparison("", model.name)
+        self._result = OtherModel("", model.name)
 
     def add(self, step: RecordedStep, contents: Contents) -> None:
         """Run one group."""
@@ -312,7 +312,7 @@ class _Run:
                 (y, before), (other_y, after) = measured
                 one.add(outcome.sample.time_utc_ns / NS, (y, um, before), (other_y, other[axis], after))
 
-    def result(self, paths: Sequence[Path]) -> Comparison:
+    def result(self, paths: Sequence[Path]) -> OtherModel:
         """Return the figures; raise an error that names the files if there are none."""
         if not self._result.samples:
             names = ", ".join(path.name for path in paths[:3])
