@@ -35,7 +35,8 @@ Policy = Literal["propose", "adopt"]
 NOW_H = 24.0
 #: Most decisions that are kept.
 MOST_STEPS = 500
-_KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
+#: Events that tell what the loop did.
+LOOP_EVENTS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: After these a candidate is proposed no longer.
 _NOT_PROPOSED = (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END)
 
@@ -207,7 +208,7 @@ class _Summary:
     def add_events(self, events: Iterable[tuple[str, str, Any, int]]) -> None:
         """Add events: kind, text, data, time."""
         for kind, text, data, at_ns in events:
-            if kind not in _KINDS:
+            if kind not in LOOP_EVENTS:
                 continue
             self._steps.append((_utc(at_ns), text))
             if kind == EventKind.DIAGNOSIS and not data.get("without"):

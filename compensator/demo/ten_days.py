@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from compensator.api.loop_diagnosis import diagnosis_in_process
+from compensator.api.shop import LOOP_EVENTS
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.commands.progress_bar import progress_bar
@@ -26,7 +27,6 @@ from compensator.demo.calibration import PERIOD_S, calibrate
 from compensator.demo.day import START_NS
 from compensator.demo.machine import PROBE_RANGE_UM, TOUCH_STD_UM, configuration
 from compensator.demo.offline import probe_of, run_alone, sample_of
-from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.report.ten_days import DAYS, MachineDays, Times
@@ -50,7 +50,6 @@ LOOP = LoopSettings(policy="adopt", every_h=24, misfit_h=3.0, record_h=24.0, sha
 PROBED_LOOP = msgspec.structs.replace(LOOP, every_h=12, record_h=48.0)
 #: Measured and predicted Y that diverge begin a diagnosis, too.
 CHECKS = Plausibility(false_alarm_days=30.0)
-_KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: Lines of the simulated devices, which are not opened here.
 _LINES = {"rtu": "/dev/null", "tcp": 502, "plc": 503, "dcon": "/dev/null", "data": 10001, "command": 23}
 
@@ -189,7 +188,7 @@ def _looped(run: OfflineLoop, samples: Sequence[tuple[Sample, float, bool]]) -> 
                 data=dict(note.data),
             )
             for note in step.events
-            if note.kind in _KINDS
+            if note.kind in LOOP_EVENTS
         ]
     return outcomes, events
 

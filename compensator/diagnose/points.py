@@ -37,7 +37,7 @@ FORM_ERROR = (0.02, 0.1)
 #: The zero of a run is free: this many times the spread of the deformation.
 ZERO_TIMES = 10.0
 #: Typical size of an initial state, as a share of the spread of the deformation.
-START_SHARE = 0.1
+STATE_SHARE = 0.1
 #: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
 SLOW_SHARE = 0.03
 #: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant, the
@@ -176,7 +176,7 @@ class Points:
         elif not self.is_exact:
             noise_um = math.hypot(noise_um, self.own_um)
         slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
-        return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, START_SHARE * self.spread_um, self.own_um])
+        return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, STATE_SHARE * self.spread_um, self.own_um])
 
     def _alike(self) -> list[tuple[int, int]]:
         """Return stretches of points with one noise and one time to the next; the last of a run is by itself."""

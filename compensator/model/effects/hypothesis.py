@@ -23,7 +23,7 @@ from compensator.model.effects.signals import RecordSignals
 #: Lags in a filter bank, and the longest of them, min.
 BANK, BANK_LONGEST_MIN = 6, 600.0
 #: Where a machine may be at rest: at the coolest start of all records, or where T_Q is AT.
-RESTS = COOLEST, EQUAL = "coolest start", "T_Q = AT"
+COOLEST, EQUAL = "coolest start", "T_Q = AT"
 #: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
 DEGC = "_degc"
 
@@ -91,7 +91,7 @@ class Hypothesis:
     ordered : bool
         Whether the searched parameters are interchangeable, so that only ascending ones are tried.
     rest : str
-        Where the machine is at rest, of the `RESTS`, for an effect that counts from there.
+        Where the machine is at rest, `COOLEST` or `EQUAL`, for an effect that counts from there.
     """
 
     effect: Effect

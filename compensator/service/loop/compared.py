@@ -32,7 +32,7 @@ from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
 from compensator.service.transfer.second_opinion import is_unusable
-from compensator.service.transfer.two_models import FEWEST, Comparison, changed
+from compensator.service.transfer.two_models import FEWEST_CHANGES, Comparison, changed
 
 
 class Compared:
@@ -178,13 +178,13 @@ class Compared:
         residuals_um = self._comparison.residuals_um
         own_um = rms_of(np.array(residuals_um).T[1])
         before = [mean for block, mean in self._present_error.blocks if block < residuals_um[0][0]]
-        return len(before) < FEWEST or sum(abs(mean) < QUIET * own_um for mean in before) >= FEWEST
+        return len(before) < FEWEST_CHANGES or sum(abs(mean) < QUIET * own_um for mean in before) >= FEWEST_CHANGES
 
     @property
     def _is_alone_near_zero(self) -> bool:
         """Whether only the other model is right about the zero, and its changes are no worse."""
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
-        if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
+        if len(residuals_um) < FEWEST_CHANGES or (found.deviations is not None and found.deviations < 0.0):
             return False
         own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
         return 0.0 < other_um <= ALONE_PART * own_um

@@ -26,7 +26,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import RecordedStep
 from compensator.service.status import Zero
-from compensator.service.transfer.two_models import FEWEST, Comparison, changed, not_judged
+from compensator.service.transfer.two_models import FEWEST_CHANGES, Comparison, changed, not_judged
 from compensator.service.transfer.warm_up import RecordedRun, Window, usable_steps, window_of
 
 #: How much of the record is compared, h.
@@ -139,7 +139,9 @@ def _described(found: ComparisonData) -> str:
 
 def _why(found: ComparisonData) -> str:
     needed = (
-        f"at least {FEWEST} probes" if found.measured_by == "probe" else f"about {(FEWEST + 2) * BLOCK_MIN / 60:g} h"
+        f"at least {FEWEST_CHANGES} probes"
+        if found.measured_by == "probe"
+        else f"about {(FEWEST_CHANGES + 2) * BLOCK_MIN / 60:g} h"
     )
     return {
         None: "",
