@@ -150,9 +150,7 @@ class Search:
             undecided=() if best.terms else undecided,
         )
 
-    def _grown(
-        self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()
-    ) -> tuple[Fit, tuple[Fit, ...]]:
+    def _grown(self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place]) -> tuple[Fit, tuple[Fit, ...]]:
         """Add one effect after another while each is worth its cost; return what few values do not decide, too.
 
         Parameters
@@ -278,7 +276,7 @@ class Search:
         ]
         return max(fits, key=lambda one: one.log_evidence).terms[-1].start
 
-    def _exchanged(self, fit: Fit, *, keep_last: bool = True, apart_from: frozenset[Place] = frozenset()) -> Fit:
+    def _exchanged(self, fit: Fit, *, keep_last: bool = True, apart_from: frozenset[Place]) -> Fit:
         """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.
 
         Parameters

@@ -34,7 +34,7 @@ START_SHARE = 0.01
 AT_ONCE = 5.0
 
 
-def switchings(rest: Rest, fit: Fit, rival: float = 0.0) -> Start | None:
+def switchings(rest: Rest, fit: Fit, rival: float) -> Start | None:
     """Find steps through a common lag that what a fit leaves may be made of, one after another.
 
     Parameters

@@ -278,7 +278,7 @@ def _candidates(outputs: Mapping[str, AxisFit], structure: Structure, period_s: 
 
 
 def calibrated_together(
-    calibrations: Mapping[str, Calibration], *, progress: Progress = unreported
+    calibrations: Mapping[str, Calibration], *, progress: Progress
 ) -> tuple[dict[str, Calibration], tuple[tuple[str, ...], ...]]:
     """Return the calibrations of all axes with common time constants where the data permit, and who has them.
 
