@@ -100,7 +100,8 @@ class Service:
         self._kept, self._state = 0, self.run.state()
 
     def process(self, sample, probe, is_visit):
-        if len(self.steps) - self._kept >= STATE_EVERY and not self.run.has_result:
+        # No state has the result of a diagnosis that counts from the next sample on.
+        if len(self.steps) - self._kept >= STATE_EVERY and self.run._found is None:
             self._kept, self._state = len(self.steps), self.run.state()
         step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
         self.steps.append((sample, probe, step, is_visit))

@@ -113,11 +113,6 @@ class OfflineLoop:
         return self._core.state.phase
 
     @property
-    def has_result(self) -> bool:
-        """Whether a diagnosis, or what stands in its place, counts from the next sample on: no state has it."""
-        return self._found is not None
-
-    @property
     def effects(self) -> tuple[str, ...]:
         """Effects of the present model."""
         return tuple(effect_names(self._compensation.model.effects))
