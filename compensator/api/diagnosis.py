@@ -16,7 +16,7 @@ import numpy as np
 
 from compensator import __version__
 from compensator.api.axis_results import AxisModels
-from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of, write_curves
+from compensator.api.files import ModelLike, Paged, Plotted, as_in_file, axes_as_in_file, models_of, write_curves
 from compensator.arrays import Vector
 from compensator.atomic_write import require_folder
 from compensator.axes import FIRST, AxisWords, column_of, label_of
@@ -55,7 +55,7 @@ from compensator.options import check_types
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Panel, Plot
+    from compensator.api.plotting import Panel
     from compensator.report.page import Page
 
 #: Files that `save` writes into a folder.
@@ -117,7 +117,7 @@ class _DiagnosisFiles(Paged):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosisResult(_DiagnosisFiles):
+class DiagnosisResult(Plotted, _DiagnosisFiles):
     """Result of a diagnosis: what a model lacks.
 
     Parameters
@@ -193,14 +193,8 @@ class DiagnosisResult(_DiagnosisFiles):
         )
         return self.words(page)
 
-    def plot(self) -> Plot:
-        """Plot the residual before and after on held-out data, one run after another."""
-        from compensator.api.plotting import stacked
-
-        return stacked(self.panels())[0]
-
     def panels(self) -> list[Panel]:
-        """Return the curves of the plot."""
+        """Return the curves of the plot: the residual before and after on held-out data, one run after another."""
         found = self.diagnosis
         hours: Vector = np.arange(found.held_out_before.size, dtype=np.float64) * found.model.period_s / 3600.0
         before, after = ("before", hours, found.held_out_before), ("after", hours, found.held_out_after)
