@@ -40,7 +40,6 @@ from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.series import series_of
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
@@ -177,7 +176,7 @@ class DiagnosisResult(Plotted, _DiagnosisFiles):
 
     def write_series(self, path: Path) -> None:
         """Write all curves as CSV."""
-        write_curves(path, self.words.table(series_of(self.diagnosis)))
+        write_curves(path, self.words.table(self.diagnosis.series()))
 
     def as_page(self) -> Page:
         """Return the content of the page."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.diagnose.advice_words import advice_lines
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import off_zero
@@ -28,7 +29,6 @@ from compensator.diagnose.summary import (
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.advice import advice_blocks
 from compensator.report.figure import Edges
 from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import (
@@ -106,7 +106,7 @@ def page_of(
     blocks += channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         blocks.append(Words(title="What could hide", lines=hidden))
-    blocks += advice_blocks(diagnosis)
+    blocks += _advice(diagnosis)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
@@ -244,6 +244,24 @@ def _causes(diagnosis: Diagnosis, effect: FoundEffect) -> list[tuple[str, str, V
     if path == "TDTF":
         return [("AT, change from the start", "K", source)]
     return [("heat, estimated", "W", source) if diagnosis.model.ttf else ("T_Q − AT", "K", source)]
+
+
+def _advice(diagnosis: Diagnosis) -> list[Block]:
+    """Return a section with the advice; none where there is nothing to do."""
+    lines, advice = advice_lines(diagnosis.advice), diagnosis.advice
+    if not lines or advice is None:
+        return []
+    blocks: list[Block] = [Words(title="Advice", lines=lines)]
+    if advice.unexplained is not None and advice.nearest:
+        rows = [[near.channel, f"{near.evidence:.1f}", f"{near.lag_min:+.0f}"] for near in advice.nearest]
+        blocks.append(
+            Table(
+                head=["nearest channel", "adds to the log evidence", "best single lag, min"],
+                rows=rows,
+                note="Each channel alone, with lags in both directions. Negative: the channel follows the cause.",
+            )
+        )
+    return [Section(title="What to measure and test next", blocks=blocks)]
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:
