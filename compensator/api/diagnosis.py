@@ -38,7 +38,7 @@ from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import DiagnosisOptions
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
+from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures

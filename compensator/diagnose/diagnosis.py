@@ -17,7 +17,7 @@ from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import Advice, advice_of
-from compensator.diagnose.ceiling import Ceiling
+from compensator.diagnose.ceiling import Ceiling, ceiling_of
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of
@@ -33,7 +33,7 @@ from compensator.diagnose.onset import explains_better, onset_in
 from compensator.diagnose.outcome import Diagnosis, Refused, Remainder, Verdict
 from compensator.diagnose.prediction import FOLDS
 from compensator.diagnose.trials import Trials
-from compensator.diagnose.verdict import ceiling_of, judged
+from compensator.diagnose.verdict import judged
 from compensator.diagnose.warning_words import ceiling_in_part, warnings_on
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import Place

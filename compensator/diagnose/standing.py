@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
+from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.display import listed
 from compensator.model.effects.hypothesis import DEGC

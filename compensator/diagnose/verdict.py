@@ -1,4 +1,4 @@
-"""The verdict on a base model from the data that were searched, and what all channels could explain."""
+"""The verdict on a base model from the data that were searched."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from compensator.arrays import Vector, rms_of
 from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.deployment import Deployment, is_adequate
-from compensator.diagnose.held_out import HeldOut
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import Verdict
 from compensator.model.late_observer import late_variance_um2
@@ -70,15 +69,3 @@ def judged(
     )
     is_missed = ceiling is not None and ceiling.is_missed(rms_of(held_out.nothing))
     return ("explained" if nothing_left and by_names and not is_missed else "partly_explained"), nothing_left
-
-
-def ceiling_of(held_out: HeldOut) -> Ceiling | None:
-    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
-    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
-    if linear >= before:
-        return None
-    return Ceiling(
-        rms_um=float(np.sqrt(linear)),
-        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
-        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
-    )

@@ -9,10 +9,11 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.advice_words import advice_lines
-from compensator.diagnose.ceiling import ceiling, falls_short, remainder
+from compensator.diagnose.ceiling_words import ceiling, falls_short
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import off_zero
+from compensator.diagnose.free_run_words import off_zero
 from compensator.diagnose.outcome import Diagnosis
+from compensator.diagnose.remainder_words import remainder
 from compensator.diagnose.standing import is_contradicted, is_in_the_model
 from compensator.diagnose.summary import (
     SHOWN,
