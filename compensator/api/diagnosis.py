@@ -40,8 +40,8 @@ from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
+from compensator.diagnose.verdict import verdict_of
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError, of_files
 from compensator.identify.pairs import pairs

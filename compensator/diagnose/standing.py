@@ -6,61 +6,14 @@ explains nothing. A run that took no part has the last word.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT
-from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.diagnose.verdict import is_confirmed
 from compensator.display import listed
 from compensator.model.effects.hypothesis import DEGC
 from compensator.model.effects.input import Input
 from compensator.model.effects.unobserved import Unobserved
-
-#: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
-#: mean square about the mean there: more is gone than stays.
-CONFIRMS = 0.5
-
-
-def is_contradicted(found: Mapping[str, Any]) -> bool:
-    """Whether the extended model is worse than the base model on data that took no part in the search.
-
-    Parameters
-    ----------
-    found : mapping
-        Content of `diagnosis.json`.
-    """
-    return any(
-        EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in _fresh(found.get("free_run", []))
-    )
-
-
-def is_confirmed(free_run: Sequence[Mapping[str, Any]], noise_um: float) -> bool:
-    """Whether what was deployed helps on every run that took no part; true where none says anything.
-
-    A run on which the base model leaves noise says nothing, nor does one on which both models are the same.
-
-    Parameters
-    ----------
-    free_run : sequence of mapping
-        As in `diagnosis.json`.
-    noise_um : float
-        What the sensors' noise makes of the residual, µm.
-    """
-    for one in _fresh(free_run):
-        base, own = one[BASE]["rms_about_mean_um"], one.get(EXTENDED, one[BASE])["rms_about_mean_um"]
-        is_noise = max(base, own) <= VERDICT_TIMES * noise_um
-        if own != base and not is_noise and own**2 > CONFIRMS * base**2:
-            return False
-    return True
-
-
-def _fresh(free_run: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    return [one["scores"] for one in free_run if one["role"] == HELD_OUT]
-
-
-def verdict_of(verdict: str, free_run: Sequence[Mapping[str, Any]], noise_um: float) -> str:
-    """Return a verdict in one word after the runs that took no part: what they do not confirm is not `explained`."""
-    return "partly_explained" if verdict == "explained" and not is_confirmed(free_run, noise_um) else verdict
 
 
 def undecided(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:

@@ -21,8 +21,8 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run_words import free_run_sentence, off_zero
 from compensator.diagnose.outcome import Diagnosis, Remainder
 from compensator.diagnose.remainder_words import lowers, remainder
-from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.standing import words as of_the_effects
+from compensator.diagnose.verdict import verdict_of
 from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.simulation import SCORE_HEAD, Scores

@@ -14,7 +14,7 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run_words import off_zero
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.remainder_words import remainder
-from compensator.diagnose.standing import is_contradicted, is_in_the_model
+from compensator.diagnose.standing import is_in_the_model
 from compensator.diagnose.summary import (
     SHOWN,
     channels_to_configure,
@@ -27,6 +27,7 @@ from compensator.diagnose.summary import (
     parameter_table,
     rivals,
 )
+from compensator.diagnose.verdict import is_contradicted
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
