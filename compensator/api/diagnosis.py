@@ -454,7 +454,8 @@ def _diagnose_axis(
     remarks += found.evidence.no_causes.values()
     is_extended = found.model is not base
     sources = [origin.provenance() for one in measured for origin in one.origins]
-    extended = as_in_file(found.model, _provenance(base, sources, found)) if is_extended else base
+    stored = partial(_stored, base, sources, found)
+    extended = stored(found.verdict) if is_extended else base
     models = {BASE: base, EXTENDED: extended} if is_extended else {BASE: base}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
     free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]
@@ -466,7 +467,7 @@ def _diagnose_axis(
             text = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
             remarks.append(Remark(DataRemark.NOT_VALIDATED, text))
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
-    return DiagnosisResult(
+    result = DiagnosisResult(
         model=extended,
         diagnosis=found,
         remarks=tuple(remarks),
@@ -475,6 +476,8 @@ def _diagnose_axis(
         since_utc_s=measured[0].since_utc_s,
         sources=tuple(sources),
     )
+    # What runs that took no part leave of the verdict is known once the model has run over them.
+    return dataclasses.replace(result, model=stored(result.verdict)) if is_extended else result
 
 
 def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
@@ -493,16 +496,17 @@ def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
     return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 
-def _provenance(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis) -> dict[str, Any]:
-    """Return the provenance of an extended model."""
-    return {
+def _stored(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis, verdict: str) -> ThermalModel:
+    """Return the extended model as in its file, with its provenance."""
+    provenance = {
         "diagnosis": {
             "source": f"compensator {__version__} diagnose",
             "base_model_sha256": base.sha256,
             "data": sources,
-            "verdict": found.verdict,
+            "verdict": verdict,
             "held_out": found.held_out,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},
             **({"since_h": found.since_h} if found.since_h else {}),
         }
     }
+    return as_in_file(found.model, provenance)
