@@ -70,17 +70,17 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
         return [*lines, "The channels can explain almost nothing of the error."]
     lines.append(share)
     if falls_short(found):
-        rest = "no remainder was added"
+        outcome = "no remainder was added"
         beside = found.get("remainder")
         if beside and not beside["deployed"]:
-            rest = "nothing is deployed"
+            outcome = "nothing is deployed"
         elif beside:
             does = "corrects some of the rest" if lowers(beside) else "does not lower the error there"
-            rest = f"the remainder {does}"
+            outcome = f"the remainder {does}"
         lines.append(
-            "The channels show clearly more than the named effects explain, and " + rest + "."
+            "The channels show clearly more than the named effects explain, and " + outcome + "."
             if found["effects"]
-            else f"The channels show something that no named effect explains; {rest}."
+            else f"The channels show something that no named effect explains; {outcome}."
         )
     return lines
 

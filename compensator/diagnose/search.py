@@ -18,7 +18,7 @@ from compensator.diagnose.criterion import MOSTLY, Criterion
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, rest_without_effects
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.prediction import Folds
 from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.standard_errors import deviations
@@ -222,7 +222,7 @@ class Search:
 
     # ------------------------------------------------------------------ steps
 
-    def _views(self, fit: Fit) -> list[Rest]:
+    def _views(self, fit: Fit) -> list[SlowRest]:
         """Return the rests with which effects are proposed: as it is, small, and between."""
         small = min(fit.rest.slow_um, max(self.evidence.probe_um, self.points.own_um))
         views = [fit.rest]
@@ -315,7 +315,7 @@ class Search:
             fit = fewer[best]
         return fit
 
-    def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
+    def _sources(self, rest: SlowRest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
         """Yield a source that no channel shows, where it may compete with the effects found.
 
         It begins when `found` has the effects of the scan: a source that cannot win is not refined.

@@ -33,8 +33,8 @@ def is_hidden(found: Mapping[str, Any]) -> bool:
 
 def held_by_the_base(found: Mapping[str, Any]) -> list[str]:
     """Return the temperatures that act beside the base's own error: it has what heat and ambient do by them already."""
-    rest = found.get("remainder") or {}
-    if not rest.get("belongs") or rest.get("instead"):
+    remainder = found.get("remainder") or {}
+    if not remainder.get("belongs") or remainder.get("instead"):
         return []
     channels = [effect.get("channel") or "" for effect in found["effects"] if effect["kind"] == Input.kind]
     return [channel for channel in channels if channel.endswith(DEGC)]
@@ -79,16 +79,16 @@ def _has_test(found: Mapping[str, Any]) -> bool:
 
 def _by_the_remainder(found: Mapping[str, Any]) -> str:
     """Return what the named effects explain and what the remainder corrects; empty where it has no part in it."""
-    rest, fit = found.get("remainder"), found.get("fit")
-    if not rest or not rest["deployed"] or not fit or found["verdict"] == "explained":
+    remainder, fit = found.get("remainder"), found.get("fit")
+    if not remainder or not remainder["deployed"] or not fit or found["verdict"] == "explained":
         return ""
     left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
-    if rest.get("instead") and is_hidden(found):
+    if remainder.get("instead") and is_hidden(found):
         return (
             f"Something acts that no channel shows by itself. All channels together make up for it: the remainder, "
             f"which explains nothing, leaves {fit['after_um']:.2f} of {fit['before_um']:.2f} µm rms in the fit."
         )
-    if rest.get("instead"):
+    if remainder.get("instead"):
         return (
             f"What is named resembles the cause most: {left}. A regularised response does better: the remainder, which "
             f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."

@@ -272,8 +272,8 @@ def _words(found: Mapping[str, Any]) -> str:
     elif _foretells_less(found):
         words = _FORETELLS_LESS
     elif _without_a_name(found):
-        rest = found.get("remainder") or {}
-        words = _OWN_PATHS if rest.get("belongs") and lowers(rest) else _WITHOUT_A_NAME
+        added = found.get("remainder") or {}
+        words = _OWN_PATHS if added.get("belongs") and lowers(added) else _WITHOUT_A_NAME
     return words
 
 

@@ -120,9 +120,9 @@ def page_of(
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     """Show the residual of the base model, the effects over it, and below it what the largest of them act by."""
     total = np.sum([effect.removed for effect in diagnosis.effects], axis=0)
-    rest, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
-    deployed = rest is not None and rest.deployed
-    stands = deployed and rest is not None and rest.instead
+    remainder, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
+    deployed = remainder is not None and remainder.deployed
+    stands = deployed and remainder is not None and remainder.instead
     causes = {cause[0]: cause for effect in diagnosis.effects for cause in _causes(diagnosis, effect)}
     below = _panels(time, list(causes.values())[:CAUSES], edges=time.unnamed_runs, height=1.7)
     one = len(diagnosis.effects) == 1
@@ -195,8 +195,8 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
     """Show the residual without the effect, the effect over it, and below it what it acts by."""
     causes = _causes(diagnosis, effect)
     below = _panels(time, causes, edges=time.unnamed, height=1.9)
-    rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
-    note = f"Residual in the data that were searched, without every other effect.{rest}"
+    with_remainder = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
+    note = f"Residual in the data that were searched, without every other effect.{with_remainder}"
     return Figure(
         title=f"{name(effect)} in the residual",
         x_label=time.label,
