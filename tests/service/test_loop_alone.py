@@ -17,7 +17,7 @@ from compensator.config import LoopSettings
 from compensator.events import DiagnosisData
 from compensator.service.loop.avoided import avoid, is_avoided
 from compensator.service.loop.decisions import LoopDecisions
-from compensator.service.loop.state import Place, Role, decode_loop
+from compensator.service.loop.state import InShadow, Role, decode_loop
 from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.second_opinion import described
@@ -40,8 +40,8 @@ def outcome(minute: int, residual_um: float, y_um: float, reasons: Sequence[str]
     return cast(Outcome, SimpleNamespace(sample=sample, estimate=estimate, offset=offset, notes=[], probes=shown))
 
 
-def place(name: str, role: Role = "candidate") -> Place:
-    return Place(sha256=name * 64, effects=[f"input:{name}"], role=role, since_utc_ns=BEGIN_NS)
+def place(name: str, role: Role = "candidate") -> InShadow:
+    return InShadow(sha256=name * 64, effects=[f"input:{name}"], role=role, since_utc_ns=BEGIN_NS)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def decided(
             return
 
 
-def loop_of(*found: Place, watched: Place | None = None, **settings: Any) -> LoopDecisions:
+def loop_of(*found: InShadow, watched: InShadow | None = None, **settings: Any) -> LoopDecisions:
     loop = LoopDecisions(LoopSettings(**{"policy": "adopt", "every_h": 12} | settings), 60.0, ["gain:DTF"])
     loop.state.found, loop.state.watched = list(found), watched
     return loop

@@ -23,7 +23,7 @@ from compensator.service.loop.avoided import avoid
 from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.schedule import begin_if_due
-from compensator.service.loop.state import LoopState, Place, Role
+from compensator.service.loop.state import InShadow, LoopState, Role
 from compensator.service.loop.weighing import failed, weigh, without_effect
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE, largest_step
@@ -96,7 +96,7 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
         assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 2 :])) < 1.0
 
 
-def misfit(*places: Place, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
+def misfit(*places: InShadow, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
     """The state of a loop whose model has erred for four hours; the loop has added its effects."""
     last = {"misfit_min": 240.0, "planned_utc_ns": NOW_NS, "adopted_utc_ns": NOW_NS - 24 * HOUR_NS}
     return LoopState(effects=effects, found=list(places), **(last | changes))
@@ -112,8 +112,8 @@ def begun(state: LoopState, after_h: float = 0.0) -> tuple[str, str]:
     return found.why, found.without
 
 
-def one(name: str, *effects: str, role: Role = "before", deviations: float | None = None) -> Place:
-    found = Place(sha256=name * 64, effects=list(effects), role=role, since_utc_ns=NOW_NS)
+def one(name: str, *effects: str, role: Role = "before", deviations: float | None = None) -> InShadow:
+    found = InShadow(sha256=name * 64, effects=list(effects), role=role, since_utc_ns=NOW_NS)
     found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations, hours=8.0)
     return found
 
@@ -231,10 +231,10 @@ def test_it_is_a_way_back_with_a_place_of_its_own() -> None:
     ],
 )
 def test_beside_another_model_a_way_back_may_be_a_candidate_and_the_other_way_round(
-    incoming: list[str], place: Place, policy: Any, role: str
+    incoming: list[str], place: InShadow, policy: Any, role: str
 ) -> None:
-    place = msgspec.json.decode(msgspec.json.encode(place), type=Place)
-    other = Place(sha256="b" * 64, effects=incoming, role="candidate", since_utc_ns=NOW_NS)
+    place = msgspec.json.decode(msgspec.json.encode(place), type=InShadow)
+    other = InShadow(sha256="b" * 64, effects=incoming, role="candidate", since_utc_ns=NOW_NS)
     loop = LoopDecisions(LoopSettings(policy=policy), 60.0, EFFECTS, misfit(place, other))
     loop.state.exchange, loop.state.incoming = "adopt", other.sha256
     loop.exchanged(NOW_NS, "c" * 64)
@@ -243,7 +243,7 @@ def test_beside_another_model_a_way_back_may_be_a_candidate_and_the_other_way_ro
 
 def test_where_more_are_candidates_after_an_exchange_than_have_places_one_ends() -> None:
     places = [*(one(name, f"gain:{name}", role="candidate", deviations=2.0) for name in "xyz"), one("w", "gain:DTF")]
-    other = Place(sha256="b" * 64, effects=["input:coolant_degc"], role="before", since_utc_ns=NOW_NS)
+    other = InShadow(sha256="b" * 64, effects=["input:coolant_degc"], role="before", since_utc_ns=NOW_NS)
     loop = LoopDecisions(LoopSettings(policy="adopt"), 60.0, EFFECTS, misfit(*places, other))
     loop.state.exchange, loop.state.incoming = "back", other.sha256
     assert about(loop.exchanged(NOW_NS, "c" * 64)) == [("end", "gives_way")] and len(loop.state.candidates) == 3

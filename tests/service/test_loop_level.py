@@ -26,7 +26,7 @@ from compensator.service.loop import decisions as decisions_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero
 from compensator.service.loop.run import OfflineLoop
-from compensator.service.loop.state import NO_VERDICT, LoopState, Place, Running
+from compensator.service.loop.state import NO_VERDICT, InShadow, LoopState, Running
 from compensator.service.loop.weighing import Diagnosed, without_candidate
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
@@ -169,7 +169,7 @@ def test_what_measured_y_did_before_the_last_zero_says_nothing_against_a_level_a
 def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clearly_nearer(own_um, other_um, raised_um):
     blocks = [Block(0, n, 30, (0.0, 0.0), (own_um + 0.3 * (n % 2), other_um + 0.1 * (n % 2), 0.0)) for n in range(20)]
     verdict = msgspec.structs.replace(NO_VERDICT, verdict=ComparisonVerdict.BETTER, y_moved=True)
-    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1, verdict=verdict)
+    place = InShadow(sha256="b" * 64, effects=[], role="before", since_utc_ns=1, verdict=verdict)
     place.comparison = ComparisonState(blocks=blocks)
     found = Compared(place, settings().loop, 60.0, ErrorBlocks())
     assert found.level_at_return_um == pytest.approx(raised_um, abs=0.2)
@@ -210,7 +210,7 @@ def test_newer_parameters_of_the_present_effects_show_no_level():
     """What begins then is none of them: a mount that slips is no reason to raise their level."""
     present, other = ([(n, 0.2 * (n % 2) if n < 12 else 9.0 + k * (n % 2)) for n in range(40)] for k in (1.0, 0.2))
     other = [(n, 6.0 * (n % 2) if n < 12 else left) for n, left in other]
-    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
     place.error = ErrorBlocks(blocks=other)
     shown_um = [
         Compared(place, settings().loop, 60.0, ErrorBlocks(blocks=present), same=same).shown_level_um
@@ -237,7 +237,7 @@ def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
     off_at_zero, zero_channels, y_moved, rms_um, level_um
 ):
     verdict = msgspec.structs.replace(NO_VERDICT, present_rms_um=4.0, candidate_rms_um=rms_um, measured_by="sensor")
-    place = Place(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
+    place = InShadow(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
     place.off_at_zero = off_at_zero
     began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
     place.error = ErrorBlocks(blocks=[(n, 6.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
@@ -273,7 +273,7 @@ def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, o
     """An effect has ended on a machine at rest: nothing changes any longer that could show it."""
     before = ErrorBlocks(blocks=[(n, before_um) for n in range(-20, blocks) if before_um is not None])
     means = [(own_um + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(blocks)]
-    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
     place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
     found = Compared(place, settings().loop, 60.0, before)
     assert found.is_better_to_go_back_to(is_new=False) is is_right
@@ -286,7 +286,7 @@ def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, o
 def test_newer_parameters_that_alone_are_right_about_the_zero_are_better(other_um, same, y_moved, is_better):
     """The present ones leave nearly a constant, which changes do not show."""
     means = [(2.4 + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(30)]
-    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
     place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
     present = ErrorBlocks(blocks=[(n, 2.4) for n in range(-20, 30)])
     found = Compared(place, settings().loop, 60.0, present, same=same, y_moved=y_moved)
@@ -378,7 +378,7 @@ def test_what_was_shown_of_the_level_goes_on_with_other_parameters_that_leave_a_
 
     present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in range(until)])
     before, after = (
-        Place(sha256=sha, effects=["delay:DTF"], role="candidate", since_utc_ns=at * BLOCK_NS, error=errors_of(left))
+        InShadow(sha256=sha, effects=["delay:DTF"], role="candidate", since_utc_ns=at * BLOCK_NS, error=errors_of(left))
         for sha, at, left in (("a", since, first), ("b", now, second))
     )
     compared = Compared(after, LoopSettings(), 60.0, present)
@@ -396,10 +396,10 @@ def test_that_an_effect_began_is_seen_in_what_older_parameters_left_before_the_r
     times = [*range(stops), *range(goes_on, until)]
     present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in times])
     left = [(n, 6.0 * (n % 2) if n < begins else 6.0) for n in times]
-    before = Place(sha256="a", effects=["delay:DTF"], role="candidate", since_utc_ns=stops * BLOCK_NS)
+    before = InShadow(sha256="a", effects=["delay:DTF"], role="candidate", since_utc_ns=stops * BLOCK_NS)
     before.error = ErrorBlocks(blocks=left[: -until + goes_on + 10])
     now = goes_on + 10
-    after = Place(sha256="b", effects=["delay:DTF"], role="candidate", since_utc_ns=now * BLOCK_NS)
+    after = InShadow(sha256="b", effects=["delay:DTF"], role="candidate", since_utc_ns=now * BLOCK_NS)
     after.error = ErrorBlocks(blocks=[one for one in left if goes_on <= one[0]])
     compared = Compared(after, LoopSettings(), 60.0, present)
     assert compared.shown_level_um is None

@@ -10,7 +10,7 @@ from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.run import OfflineLoop
-from compensator.service.loop.state import Place
+from compensator.service.loop.state import InShadow
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.refutation import evidence
 from compensator.service.transfer.two_models import BLOCK_NS, SURE_PART, Block, ComparisonState
@@ -91,7 +91,7 @@ def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_
 def taken_over(blocks: int, own: int, wrong: float) -> Compared:
     """What is compared of newer parameters, with as many blocks before them and as many of their own."""
     rng = np.random.default_rng(9)
-    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=blocks * BLOCK_NS)
+    place = InShadow(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=blocks * BLOCK_NS)
     for n in range(blocks + own):
         moves, error = 2.0 * float(rng.normal()), 2.0 * float(rng.normal())
         means = (error, error - wrong * moves, moves)
@@ -113,7 +113,7 @@ def test_before_their_own_hours_judge_all_hours_are_said_and_end_nothing(own: in
 
 def test_two_candidates_are_compared_by_blocks_of_the_same_samples() -> None:
     """A zero divides the half hour 3 for both; in the half hour 6 the second one has taken over."""
-    compared = [Place(sha256=name * 64, effects=[], role="candidate", since_utc_ns=1) for name in "ab"]
+    compared = [InShadow(sha256=name * 64, effects=[], role="candidate", since_utc_ns=1) for name in "ab"]
     for place, by in zip(compared, (1.0, 2.0), strict=True):
         parts = [(0, 2), (0, 3), (1, 3), (1, 4), (1, 5), *([(1, 6)] if by == 1.0 else [(1, 6), (2, 6)]), (2, 7)]
         means = [(0.0, by * (10 * zero + number), 0.0) for zero, number in parts]
@@ -125,7 +125,7 @@ def test_two_candidates_are_compared_by_blocks_of_the_same_samples() -> None:
     assert len({block.zeros for block in state.blocks}) == 3
 
 
-def beside_state(place: Place, rival: Place) -> ComparisonState:
+def beside_state(place: InShadow, rival: InShadow) -> ComparisonState:
     Compared(place, LoopSettings(), 60.0, ErrorBlocks()).go_on_beside(rival, 0.0)
     return place.comparison
 
@@ -135,7 +135,7 @@ def test_newer_parameters_are_judged_by_all_hours_or_by_their_own_whichever_show
     """The effect acts all the time, or from the beginning of their own hours on."""
     takes_over, now = 40, 56
     rng = np.random.default_rng(8)
-    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
+    place = InShadow(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
     for n in range(now):
         moves, error = 2.0 * float(rng.normal()), 0.3 * float(rng.normal())
         own, other = (moves + error, error) if n >= right_from else (error, error - moves)

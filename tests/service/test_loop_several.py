@@ -19,7 +19,7 @@ from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.proof import CANDIDATES, shared
 from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop
-from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.state import InShadow, LoopState, Running
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
@@ -77,13 +77,13 @@ def stronger_dtf(change: float, acts: Callable[[int], bool]) -> Callable[[int], 
     return lambda i: crept(i) + gain(i) * acts(i)
 
 
-def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> Place:
-    found = Place(sha256=name * 64, effects=[f"gain:{name}"], role=role, since_utc_ns=NOW_NS - 8 * HOUR_NS)
+def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> InShadow:
+    found = InShadow(sha256=name * 64, effects=[f"gain:{name}"], role=role, since_utc_ns=NOW_NS - 8 * HOUR_NS)
     found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations, hours=hours)
     return found
 
 
-def full(*places: Place, policy: Any = "adopt") -> LoopDecisions:
+def full(*places: InShadow, policy: Any = "adopt") -> LoopDecisions:
     """A loop all of whose places are taken, and a diagnosis that has ended."""
     diagnosis = Running(from_utc_ns=NOW_NS - 36 * HOUR_NS, to_utc_ns=NOW_NS, why="planned")
     return LoopDecisions(LoopSettings(policy=policy), 60.0, [], LoopState(found=list(places), diagnosis=diagnosis))
@@ -133,7 +133,7 @@ def test_what_is_never_compared_keeps_no_place() -> None:
 class Stands:
     """Stands for what is compared of a candidate that is better than the present model."""
 
-    def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
+    def __init__(self, one: InShadow, surpasses: str = "", level_um: float | None = 0.0) -> None:
         self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
         self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
         self.level_at_return_um, self.goes_back, self.is_alone_right = 0.0, True, False
@@ -144,7 +144,7 @@ class Stands:
     def is_better(self, now_ns: int) -> bool:
         return True
 
-    def beside(self, rival: Place) -> ComparisonData:
+    def beside(self, rival: InShadow) -> ComparisonData:
         self.asked.append(rival.sha256)
         if rival.sha256[0] not in self._surpasses:
             return ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=0.0, ratio=1.0)
@@ -422,7 +422,7 @@ def newer_parameters() -> LoopDecisions:
     """A loop with one candidate, and newer parameters of its effects that are warmed up."""
     loop = LoopDecisions(settings().loop, 60.0, [])
     effects = ["gain DTF", "input:coolant_degc"]
-    loop.state.found = [Place(sha256="a" * 64, effects=effects, role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
+    loop.state.found = [InShadow(sha256="a" * 64, effects=effects, role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
     loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
     # A diagnosis lists them by what they remove.
     found = DiagnosisData(verdict="explained", candidate_sha256="b" * 64, effects=effects[::-1])

@@ -29,7 +29,7 @@ from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.found import Found
 from compensator.service.loop.run import LoopStep, OfflineLoop
-from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.state import InShadow, LoopState, Running
 from compensator.service.loop.weighing import Weighed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
@@ -154,7 +154,7 @@ def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
 def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 0.0) -> tuple[LoopDecisions, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
     now_ns = ADOPTED_NS + round(hours * HOUR_NS)
-    before = Place(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
+    before = InShadow(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
     state = LoopState(
         watched=before,
         adopted_utc_ns=ADOPTED_NS,
@@ -397,7 +397,7 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
         outcomes.append(present.process(one))
         before.process(one)
     core = ShadowedLoop(config, present.model, {})
-    core.state.watched = Place(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
+    core.state.watched = InShadow(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
     core.state.exchange, core.state.incoming = "back", sha256_of(QUILL)
     core.shadows[sha256_of(QUILL)] = Shadow(before, QUILL)
     store = ModelStore(tmp_path, QUILL, "vmc-07")

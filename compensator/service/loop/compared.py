@@ -27,7 +27,7 @@ from compensator.service.loop.proof import (
     is_enough,
     shared,
 )
-from compensator.service.loop.state import NO_VERDICT, Place
+from compensator.service.loop.state import NO_VERDICT, InShadow
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
@@ -40,7 +40,7 @@ class Compared:
 
     Parameters
     ----------
-    place : Place
+    place : InShadow
         The place; its comparison and verdict are kept up to date.
     settings : config.LoopSettings
         `[loop]`.
@@ -60,7 +60,7 @@ class Compared:
 
     def __init__(
         self,
-        place: Place,
+        place: InShadow,
         settings: LoopSettings,
         period_s: float,
         present_error: ErrorBlocks,
@@ -209,7 +209,7 @@ class Compared:
         since_ns = self._place.level_utc_ns or self._place.since_utc_ns
         return level_um(self._present_error.blocks, self._place.error.blocks, since_ns=since_ns)
 
-    def go_on_with(self, before: Place, now_ns: int) -> None:
+    def go_on_with(self, before: InShadow, now_ns: int) -> None:
         """Take over what a candidate with the same effects has shown.
 
         Also of its level: hours that it did not know have shown it, and if the errors of this one stay in them, too,
@@ -225,12 +225,12 @@ class Compared:
             place.level_utc_ns = 0
         place.error.go_on_after(before.error)
 
-    def beside(self, rival: Place) -> ComparisonData:
+    def beside(self, rival: InShadow) -> ComparisonData:
         """Compare the model with another one in shadow, as if that were the present one, on the hours of both."""
         state = beside(rival.comparison, self._place.comparison)
         return Comparison(self._period_s, state).verdict(deviations=self._settings.deviations)
 
-    def go_on_beside(self, present: Place, level_um: float) -> None:
+    def go_on_beside(self, present: InShadow, level_um: float) -> None:
         """Go on after another model in shadow, raised by so much, has become the present one: the hours of both count.
 
         Nothing is proposed any longer.

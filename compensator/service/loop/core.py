@@ -33,8 +33,8 @@ def shadow_files(state: LoopState) -> dict[str, tuple[str, str]]:
 
     Examples
     --------
-    >>> from compensator.service.loop.state import Place
-    >>> places = [Place(sha256=sha, effects=[], role="candidate", since_utc_ns=1) for sha in "ab"]
+    >>> from compensator.service.loop.state import InShadow
+    >>> places = [InShadow(sha256=sha, effects=[], role="candidate", since_utc_ns=1) for sha in "ab"]
     >>> list(shadow_files(LoopState(found=places)).values())
     [('candidate.toml', 'candidate_state.json'), ('candidate_2.toml', 'candidate_2_state.json')]
     """
