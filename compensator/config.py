@@ -26,7 +26,7 @@ Amount = Annotated[float, Meta(ge=1, le=1e9)]
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
 #: Limits of the rate of a temperature, K/min, and the temperatures that any part of a machine can have, °C.
-_RATES, _TEMPERATURES = (0.001, 10_000.0), (-273.15, 2000.0)
+_RATES, _DEGC_RANGE = (0.001, 10_000.0), (-273.15, 2000.0)
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 #: Largest magnitude of a value of a channel of any unit.
 _VALUE_MAX = 1e12
@@ -184,7 +184,7 @@ class Probe(_Table, frozen=True, kw_only=True):
     match_um: Micrometres = 1.0
 
 
-class Loop(_Table, frozen=True, kw_only=True):
+class LoopSettings(_Table, frozen=True, kw_only=True):
     """`[loop]`: the service looks for what its model lacks; without this table it does not.
 
     `policy`: `propose` asks a person before a better model is adopted, `adopt` adopts it. `at_utc`, `every_h`: a
@@ -310,7 +310,7 @@ class Config(_Table, frozen=True, kw_only=True):
     restart: Restart = Restart()
     plausibility: Plausibility | None = None
     probe: Probe | None = None
-    loop: Loop | None = None
+    loop: LoopSettings | None = None
     axis: Axes | None = None
 
 
@@ -522,7 +522,7 @@ def _check(config: Config) -> None:
     if config.axis is not None:
         check_axes(config.axis, loop=config.loop is not None and config.loop.is_on)
     for key in ("t_q_degc", "at_degc"):
-        _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key), _TEMPERATURES)
+        _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key), _DEGC_RANGE)
     _check_zenoh(config.zenoh)
 
 
@@ -564,7 +564,7 @@ def _check_channel(channel: Channel, devices: set[str]) -> None:
     if is_temperature and rate is not None and not _RATES[0] <= rate <= _RATES[1]:
         raise ConfigError(f"{where}: rate_max_per_min = {rate:g}, expected from {_RATES[0]:g} to {_RATES[1]:g}")
     if channel.range is not None:
-        possible = _TEMPERATURES if is_temperature else (-_VALUE_MAX, _VALUE_MAX)
+        possible = _DEGC_RANGE if is_temperature else (-_VALUE_MAX, _VALUE_MAX)
         _check_range(f"{where}: range", channel.range, possible)
 
 

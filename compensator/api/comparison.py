@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compensator.api.axis_results import PagedAxes
-from compensator.api.files import ModelLike, Paged, models_of, write_curves
+from compensator.api.files import ModelLike, Paged, Plotted, models_of, write_curves
 from compensator.api.simulation import doubts
 from compensator.arrays import Vector
 from compensator.axes import AxisWords
@@ -29,12 +29,12 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.options import check_types
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Panel, Plot
+    from compensator.api.plotting import Panel
     from compensator.report.page import Page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class ComparisonResult(Paged):
+class ComparisonResult(Plotted, Paged):
     """Errors of models in free run on the same samples.
 
     Parameters
@@ -169,14 +169,8 @@ class ComparisonResult(Paged):
             data=self.data,
         )
 
-    def plot(self) -> Plot:
-        """Plot measured and predicted deformation, and the error of each model, over time."""
-        from compensator.api.plotting import stacked
-
-        return stacked(self.panels())[0]
-
     def panels(self) -> list[Panel]:
-        """Return the curves of the plot."""
+        """Return the curves of the plot: measured and predicted deformation, and the error of each model."""
         curves = [("measured", self.t_h, self.y_um)]
         curves += [(name, self.t_h, values) for name, values in self.predictions.items()]
         residuals = [(name, self.t_h, values) for name, values in self.residuals.items()]

@@ -16,7 +16,7 @@ import numpy as np
 
 from compensator import __version__
 from compensator.api.axis_results import AxisModels
-from compensator.api.files import ModelLike, Paged, as_in_file, axes_as_in_file, models_of, write_curves
+from compensator.api.files import ModelLike, Paged, Plotted, as_in_file, axes_as_in_file, models_of, write_curves
 from compensator.arrays import Vector
 from compensator.atomic_write import require_folder
 from compensator.axes import FIRST, AxisWords, column_of, label_of
@@ -38,11 +38,10 @@ from compensator.diagnose.across import MachineEffect, across, missing_places
 from compensator.diagnose.diagnosis import DiagnosisOptions
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
+from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.series import series_of
-from compensator.diagnose.standing import verdict_of
 from compensator.diagnose.summary import contents, figures
+from compensator.diagnose.verdict import verdict_of
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError, of_files
 from compensator.identify.pairs import pairs
@@ -55,7 +54,7 @@ from compensator.options import check_types
 from compensator.progress import ExecutorMap, Progress, after, unreported
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Panel, Plot
+    from compensator.api.plotting import Panel
     from compensator.report.page import Page
 
 #: Files that `save` writes into a folder.
@@ -117,7 +116,7 @@ class _DiagnosisFiles(Paged):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosisResult(_DiagnosisFiles):
+class DiagnosisResult(Plotted, _DiagnosisFiles):
     """Result of a diagnosis: what a model lacks.
 
     Parameters
@@ -177,7 +176,7 @@ class DiagnosisResult(_DiagnosisFiles):
 
     def write_series(self, path: Path) -> None:
         """Write all curves as CSV."""
-        write_curves(path, self.words.table(series_of(self.diagnosis)))
+        write_curves(path, self.words.table(self.diagnosis.series()))
 
     def as_page(self) -> Page:
         """Return the content of the page."""
@@ -193,14 +192,8 @@ class DiagnosisResult(_DiagnosisFiles):
         )
         return self.words(page)
 
-    def plot(self) -> Plot:
-        """Plot the residual before and after on held-out data, one run after another."""
-        from compensator.api.plotting import stacked
-
-        return stacked(self.panels())[0]
-
     def panels(self) -> list[Panel]:
-        """Return the curves of the plot."""
+        """Return the curves of the plot: the residual before and after on held-out data, one run after another."""
         found = self.diagnosis
         hours: Vector = np.arange(found.held_out_before.size, dtype=np.float64) * found.model.period_s / 3600.0
         before, after = ("before", hours, found.held_out_before), ("after", hours, found.held_out_after)
@@ -461,7 +454,8 @@ def _diagnose_axis(
     remarks += found.evidence.no_causes.values()
     is_extended = found.model is not base
     sources = [origin.provenance() for one in measured for origin in one.origins]
-    extended = as_in_file(found.model, _provenance(base, sources, found)) if is_extended else base
+    stored = partial(_stored, base, sources, found)
+    extended = stored(found.verdict) if is_extended else base
     models = {BASE: base, EXTENDED: extended} if is_extended else {BASE: base}
     errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
     free_run = [errors(models, measured, SEARCHED, from_h=found.since_h)]
@@ -473,7 +467,7 @@ def _diagnose_axis(
             text = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
             remarks.append(Remark(DataRemark.NOT_VALIDATED, text))
         free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
-    return DiagnosisResult(
+    result = DiagnosisResult(
         model=extended,
         diagnosis=found,
         remarks=tuple(remarks),
@@ -482,6 +476,8 @@ def _diagnose_axis(
         since_utc_s=measured[0].since_utc_s,
         sources=tuple(sources),
     )
+    # What runs that took no part leave of the verdict is known once the model has run over them.
+    return dataclasses.replace(result, model=stored(result.verdict)) if is_extended else result
 
 
 def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
@@ -500,16 +496,17 @@ def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
     return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
 
 
-def _provenance(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis) -> dict[str, Any]:
-    """Return the provenance of an extended model."""
-    return {
+def _stored(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis, verdict: str) -> ThermalModel:
+    """Return the extended model as in its file, with its provenance."""
+    provenance = {
         "diagnosis": {
             "source": f"compensator {__version__} diagnose",
             "base_model_sha256": base.sha256,
             "data": sources,
-            "verdict": found.verdict,
+            "verdict": verdict,
             "held_out": found.held_out,
             "held_out_rms_um": {"before": found.before.rms_um, "after": found.after.rms_um},
             **({"since_h": found.since_h} if found.since_h else {}),
         }
     }
+    return as_in_file(found.model, provenance)

@@ -21,6 +21,7 @@ from compensator.model.simulation import csv_rows
 from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
+    from compensator.api.plotting import Panel, Plot
     from compensator.report.page import Page
 
 ModelLike = ThermalModel | Mapping[str, ThermalModel] | str | os.PathLike[str]
@@ -108,6 +109,22 @@ def write_curves(path: str | os.PathLike[str], columns: dict[str, Vector]) -> Pa
     with atomic_write(Path(path), may_stream=True) as file:
         csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
     return Path(path)
+
+
+class Plotted(Shown):
+    """A result that a notebook plots."""
+
+    __slots__ = ()
+
+    def panels(self) -> list[Panel]:
+        """Return the curves of the plot."""
+        raise NotImplementedError
+
+    def plot(self) -> Plot:
+        """Plot the curves of `panels` over time."""
+        from compensator.api.plotting import stacked
+
+        return stacked(self.panels())[0]
 
 
 class Paged(Shown):

@@ -29,7 +29,7 @@ from compensator.data.measurement import (
 from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.errors import UsageError
 from compensator.identify.calibration import Calibration, calibrate, of_machine
-from compensator.identify.comparison import compare
+from compensator.identify.coefficients import compare
 from compensator.identify.criticism import criticise
 from compensator.identify.pairs import Pair, pairs
 from compensator.identify.settings import LONGEST_H, Method, Settings

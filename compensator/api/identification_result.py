@@ -17,7 +17,7 @@ from compensator.data.frames import frame_of
 from compensator.display import Table, Words, is_determined
 from compensator.errors import of_files
 from compensator.identify.calibration import Calibration, joined
-from compensator.identify.comparison import Row
+from compensator.identify.coefficients import Row
 from compensator.identify.criticism import Criticism
 from compensator.identify.summary import contents, estimates, figures
 from compensator.model.free_run import FreeRunErrors

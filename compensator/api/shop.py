@@ -14,16 +14,16 @@ from typing import Any, Literal, cast
 import msgspec
 import numpy as np
 
-from compensator.api.loop import diagnosis_in_process
+from compensator.api.loop_diagnosis import diagnosis_in_process
 from compensator.clock import HOUR_NS, NS
-from compensator.config import Config, Loop
+from compensator.config import Config, LoopSettings
 from compensator.errors import CompensatorError, DataError
 from compensator.events import CommandName, EventKind, LoopAction, LoopData, Note, command_of
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.recording.container import Container
 from compensator.recording.reading import in_order, recordings_in
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import same_effects
 from compensator.service.probing import ReceivedProbe
 from compensator.service.replay import RecordedStep, execute, setup_of, steps_in
@@ -35,7 +35,8 @@ Policy = Literal["propose", "adopt"]
 NOW_H = 24.0
 #: Most decisions that are kept.
 MOST_STEPS = 500
-_KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
+#: Events that tell what the loop did.
+LOOP_EVENTS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: After these a candidate is proposed no longer.
 _NOT_PROPOSED = (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END)
 
@@ -130,10 +131,10 @@ def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
     if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
         raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
     # A table that is off keeps its other settings: with them the service would decide.
-    loop = msgspec.structs.replace(config.loop or Loop(policy=policy), policy=policy)
+    loop = msgspec.structs.replace(config.loop or LoopSettings(policy=policy), policy=policy)
     config = msgspec.structs.replace(config, loop=loop)
     alone = _Summary("", "", is_recorded=False)
-    followed = _Followed(LoopRun(config, file, diagnosis_in_process(config)))
+    followed = _Followed(OfflineLoop(config, file, diagnosis_in_process(config)))
     of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
     for step in _steps(paths, summary.cut):
         outcome, first = of_loop.process(step), of_first.process(step)
@@ -207,7 +208,7 @@ class _Summary:
     def add_events(self, events: Iterable[tuple[str, str, Any, int]]) -> None:
         """Add events: kind, text, data, time."""
         for kind, text, data, at_ns in events:
-            if kind not in _KINDS:
+            if kind not in LOOP_EVENTS:
                 continue
             self._steps.append((_utc(at_ns), text))
             if kind == EventKind.DIAGNOSIS and not data.get("without"):
@@ -291,7 +292,7 @@ def _utc(time_ns: int) -> str:
 class _Followed:
     """A run of the loop that takes recorded samples as a compensation does."""
 
-    def __init__(self, run: LoopRun) -> None:
+    def __init__(self, run: OfflineLoop) -> None:
         self._run = run
         self._probes: tuple[ReceivedProbe, ...] = ()
         #: Events of the last sample.

@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compensator.api.axis_results import AxisResults
-from compensator.api.files import write_curves
+from compensator.api.files import Plotted, write_curves
 from compensator.arrays import Vector
 from compensator.axes import AxisWords
 from compensator.codes import Remark
-from compensator.display import Shown, Table, Words, text_of_all, warnings_of
+from compensator.display import Table, Words, text_of_all, warnings_of
 from compensator.model.free_run import NOTHING, in_words, table_of_scores
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 if TYPE_CHECKING:
-    from compensator.api.plotting import Panel, Plot
+    from compensator.api.plotting import Panel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class SimulationResult(Shown, Mapping[str, Vector]):
+class SimulationResult(Plotted, Mapping[str, Vector]):
     """Columns of a free or corrected run by name, as `compensator simulate` writes them.
 
     Parameters
@@ -103,14 +103,8 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         """
         return write_curves(path, self.table)
 
-    def plot(self) -> Plot:
-        """Plot measured and predicted deformation, and the residual."""
-        from compensator.api.plotting import stacked
-
-        return stacked(self.panels())[0]
-
     def panels(self) -> list[Panel]:
-        """Return the curves of the plot."""
+        """Return the curves of the plot: measured and predicted deformation, and the residual."""
         hours = self["t_s"] / 3600.0
         words = self.words
         curves = [("predicted", hours, self[words("y_pred_um")])]

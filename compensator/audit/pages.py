@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator import __version__
-from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, utc
+from compensator.audit.machine_audit import Audit
+from compensator.audit.other_model import OtherModel, worst_utc
 from compensator.audit.result import RecordingAudit
-from compensator.audit.series import Audit
 from compensator.audit.verdict import partly, verdict
 from compensator.axes import label_of
 from compensator.codes import AuditFinding, RecordingEnd
@@ -276,12 +276,12 @@ class Curves:
             self._rows = []
 
 
-def comparison_page(found: Comparison, curves: Curves) -> Page:
+def comparison_page(found: OtherModel, curves: Curves) -> Page:
     """Make the page that compares another model with the recorded one.
 
     Parameters
     ----------
-    found : Comparison
+    found : OtherModel
         The figures.
     curves : Curves
         Both offsets.
@@ -295,10 +295,10 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
         clock=True,
         x_limits=ends,
         lines=(curves.line(recorded, "recorded"), curves.line(other, "other")),
-        note=f"They differ by {_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
+        note=f"They differ by {_um(found.own.offsets.rms)} µm rms, at most {_um(abs(found.own.offsets.peak))} µm.",
     )
     blocks: list[Block] = [offsets]
-    if found.left_before.samples:
+    if found.own.left_before.samples:
         left = (curves.line(recorded, "left recorded"), curves.line(other, "left other"))
         blocks.append(
             Figure(
@@ -320,12 +320,12 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
     )
 
 
-def _better(found: Comparison) -> tuple[str, Tone]:
-    before, after = found.left_before.rms, found.left_after.rms
-    if not found.left_before.samples:
+def _better(found: OtherModel) -> tuple[str, Tone]:
+    before, after = found.own.left_before.rms, found.own.left_after.rms
+    if not found.own.left_before.samples:
         return (
             f"Y was not measured, so it is unknown which model is better: the offset of “{found.other}” differs by "
-            f"{_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
+            f"{_um(found.own.offsets.rms)} µm rms, at most {_um(abs(found.own.offsets.peak))} µm.",
             "warn",
         )
     words = (
@@ -342,7 +342,7 @@ def _better(found: Comparison) -> tuple[str, Tone]:
     return words, tones[0] if tones.count(tones[0]) == len(tones) else "warn"
 
 
-def _before_and_after(found: Comparison) -> Table:
+def _before_and_after(found: OtherModel) -> Table:
     def row(name: str, spread: Spread) -> list[Cell]:
         worst = worst_utc(spread) if spread.samples else "–"
         return [name, _um(spread.rms), _um(abs(spread.peak)), str(spread.samples), worst]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from compensator.audit.series import Audit
+    from compensator.audit.machine_audit import Audit
 
 
 def verdict(found: Audit) -> str:

@@ -10,7 +10,7 @@ from compensator.api.diagnosis import FILES, DiagnosisResult, diagnose
 from compensator.api.files import models_of
 from compensator.commands import Answer
 from compensator.commands.outputs import pages_text
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import workers
 from compensator.data.axes import AxisLike
 from compensator.data.measurement import measurements

@@ -10,7 +10,7 @@ from compensator.api.identification_result import IdentificationResult
 from compensator.api.identified_axes import IdentifiedAxes
 from compensator.commands import Answer
 from compensator.commands.outputs import pages_text
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
 from compensator.model.model_file import BUILT_IN

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compensator.commands import Answer
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import in_parallel
 from compensator.errors import DataError
 

@@ -45,7 +45,7 @@ def main() -> int:
 
 
 def _diagnose(job: Job, folder: Path) -> Result:
-    from compensator.api.loop import diagnoses_of_table, summarised
+    from compensator.api.loop_diagnosis import diagnoses_of_table, summarised
     from compensator.input_file import MODEL_BYTES, read_file
     from compensator.service.loop.job import read_record
     from compensator.service.loop.record import table_of_rows

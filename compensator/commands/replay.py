@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compensator.atomic_write import atomic_write
-from compensator.audit.comparison import COLUMNS, compare
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
+from compensator.audit.other_model import COLUMNS, compare
 from compensator.commands import Answer
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.input_file import resolved

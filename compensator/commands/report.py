@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from compensator.commands import Answer
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.errors import UsageError
 from compensator.input_file import resolved
 

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from compensator.arrays import Indices, Mask, Vector, stretches_of
 from compensator.codes import DataRemark, Remark
-from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
+from compensator.data.record import SHORT_GAP_SAMPLES, TEMPERATURES, SampledRecord
 from compensator.data.runs import is_sparse, noise_std
 from compensator.data.screening import DEAD_SAMPLES, LIVELY_STILL, LIVELY_TURNS
 from compensator.errors import DataError
@@ -26,8 +26,6 @@ TOGETHER = 0.3
 BESIDE_SAMPLES = 5
 #: Endings of what is measured and follows slowly: temperatures, displacements, tilts. All else may be commanded.
 TEMPERATURE, SLOW = "_degc", ("_degc", "_um", "_urad")
-#: Temperatures that no model runs without.
-NEEDED = ("t_q_degc", "at_degc")
 #: Something is commanded where it changes by this share of its span in a sample.
 COMMANDED = 0.2
 #: Shortest stand at the end of a range, all of them together, and how far beside it its slope is looked at, samples.
@@ -91,7 +89,7 @@ def cleaned(name: str, records: Sequence[SampledRecord]) -> tuple[tuple[SampledR
             if count:
                 remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {count} outlier(s) left out."))
             if column.endswith(SLOW) and (stand := stand_at_limit(kept)):
-                needed = column in NEEDED
+                needed = column in TEMPERATURES
                 then = "what it was there is not known" if needed else "not used there"
                 words = f"{name}: {stand.in_words(column, record.t_s)}; {then}."
                 remarks.append(Remark(DataRemark.AT_LIMIT, words))
@@ -110,7 +108,7 @@ def refuse_at_limit(name: str, record: SampledRecord) -> None:
     DataError
         Naming channel, value, times and what to do.
     """
-    for column in NEEDED:
+    for column in TEMPERATURES:
         if stand := stand_at_limit(record.columns[column]):
             raise DataError(
                 f"{name}: {stand.in_words(column, record.t_s)}: the range of its sensor or transmitter? What the "

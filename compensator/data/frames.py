@@ -95,7 +95,7 @@ def frame_of(columns: Mapping[str, Any], index: Any = None) -> Any:
     return sys.modules["pandas"].DataFrame(columns, index=index)
 
 
-def time_index(t_s: Vector, start_utc_s: float | None, *, local: bool = False) -> Any:
+def time_index(t_s: Vector, start_utc_s: float | None, *, local: bool) -> Any:
     """Return the index of a DataFrame: times in UTC where that of `t_s` = 0 is known, None for rows by number.
 
     Where the times that came in had no zone (`local`), these have none either.

@@ -38,7 +38,7 @@ _ROW_OF_SAMPLE = 0.75
 _SPARSE = 0.1
 
 
-def to_grid(table: Table, period_s: float, *, whole_y: bool = False) -> SampledData:
+def to_grid(table: Table, period_s: float, *, whole_y: bool) -> SampledData:
     """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
 
     Rows without T_Q or AT are a gap like rows that are missing: the model knows nothing there. With `whole_y` they are

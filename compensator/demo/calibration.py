@@ -13,7 +13,7 @@ from compensator.api.identification_result import IdentificationResult
 from compensator.arrays import Vector
 from compensator.commands.identify import write
 from compensator.demo.machine import MACHINES
-from compensator.identify.comparison import Row
+from compensator.identify.coefficients import Row
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 
 PERIOD_S = 60.0

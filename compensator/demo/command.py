@@ -12,7 +12,7 @@ from typing import Any
 
 from compensator.commands import Answer
 from compensator.commands.outputs import pages_text
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import calibrate, paper_case
 from compensator.demo.day import run_day

@@ -28,7 +28,7 @@ SECOND_DAY = 2
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Adopted:
+class TwoDays:
     """What was found on the first day, and the second day with it.
 
     Parameters
@@ -54,7 +54,7 @@ def effect_of(seed: int, hours: float) -> UndeclaredEffect:
     return draw_effect(seed, EFFECT_UM, hours)
 
 
-def close_the_loop(folder: Path, *, hours: float, seed: int) -> Adopted:
+def close_the_loop(folder: Path, *, hours: float, seed: int) -> TwoDays:
     """Run a day with an undeclared effect, diagnose its recordings, and run a second day with the extended model.
 
     The effect is drawn by the seed and not disclosed before the results are written.
@@ -75,7 +75,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> Adopted:
     found = diagnose_files(recordings, first_model, extended.parent).result
     # An unchanged model is not adopted.
     model = extended if _content(extended) != _content(first_model) else None
-    return Adopted(
+    return TwoDays(
         found=found,
         model=model,
         offset_changes=_content(extended, y_std_um=1.0) != _content(first_model, y_std_um=1.0),
@@ -97,13 +97,13 @@ def second_day(folder: Path, name: str, *, hours: float, seed: int, adopt: Path 
 
 
 def figures_of_loop(
-    adopted: Adopted, first: Day, effect: UndeclaredEffect
+    adopted: TwoDays, first: Day, effect: UndeclaredEffect
 ) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:
     """Return the figures of the loop, and the error on the second day over time by model, h and µm.
 
     Parameters
     ----------
-    adopted : Adopted
+    adopted : TwoDays
         What was found and adopted.
     first : Day
         The second day with the first model.

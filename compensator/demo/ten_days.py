@@ -16,21 +16,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from compensator.api.loop import diagnosis_in_process
+from compensator.api.loop_diagnosis import diagnosis_in_process
+from compensator.api.shop import LOOP_EVENTS
 from compensator.arrays import Vector
 from compensator.clock import NS
-from compensator.commands.progress import progress_bar
+from compensator.commands.progress_bar import progress_bar
 from compensator.commands.workers import in_parallel
-from compensator.config import Channel, Config, Loop, Plausibility, parse_config
+from compensator.config import Channel, Config, LoopSettings, Plausibility, parse_config
 from compensator.demo.calibration import PERIOD_S, calibrate
 from compensator.demo.day import START_NS
 from compensator.demo.machine import PROBE_RANGE_UM, TOUCH_STD_UM, configuration
 from compensator.demo.offline import probe_of, run_alone, sample_of
-from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.report.ten_days import DAYS, MachineDays, Times
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.outcome import Outcome
 from sim_hardware.physics import Duty, QuillMachine, World, usual_sensors
 from sim_hardware.physics.effects import BearingFriction, FanMotor
@@ -45,12 +45,11 @@ FIRST = BearingFriction(full_speed_w=6.0)
 SECOND = FanMotor(full_speed_w=30.0, place="rear")
 #: A probe in minutes, and the seed of its noise beside that of the demo.
 PROBE_EVERY_MIN, PROBE_SEED = 60, 16
-LOOP = Loop(policy="adopt", every_h=24, misfit_h=3.0, record_h=24.0, shadow_h=6.0)
+LOOP = LoopSettings(policy="adopt", every_h=24, misfit_h=3.0, record_h=24.0, shadow_h=6.0)
 #: The same with a probe each hour: a day of them names nothing.
 PROBED_LOOP = msgspec.structs.replace(LOOP, every_h=12, record_h=48.0)
 #: Measured and predicted Y that diverge begin a diagnosis, too.
 CHECKS = Plausibility(false_alarm_days=30.0)
-_KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: Lines of the simulated devices, which are not opened here.
 _LINES = {"rtu": "/dev/null", "tcp": 502, "plc": 503, "dcon": "/dev/null", "data": 10001, "command": 23}
 
@@ -88,7 +87,7 @@ def machine_days(out: Path, name: str, *, seed: int) -> MachineDays:
     record = _record(seed)
     config = _config(name, is_probed=is_probed)
     samples = _samples(name, config, record, is_probed=is_probed, seed=seed)
-    outcomes, events = _looped(LoopRun(config, file, diagnosis_in_process(config)), samples)
+    outcomes, events = _looped(OfflineLoop(config, file, diagnosis_in_process(config)), samples)
     first = run_alone(config, parse_model(file, source="calibration"), samples)
     return MachineDays(
         name=name,
@@ -168,7 +167,7 @@ def _samples(
     ]
 
 
-def _looped(run: LoopRun, samples: Sequence[tuple[Sample, float, bool]]) -> tuple[list[Outcome], list[Event]]:
+def _looped(run: OfflineLoop, samples: Sequence[tuple[Sample, float, bool]]) -> tuple[list[Outcome], list[Event]]:
     """Return the outcome of each sample, and the events of the loop."""
     outcomes, events = list[Outcome](), list[Event]()
     for sample, shown_um, _ in samples:
@@ -189,7 +188,7 @@ def _looped(run: LoopRun, samples: Sequence[tuple[Sample, float, bool]]) -> tupl
                 data=dict(note.data),
             )
             for note in step.events
-            if note.kind in _KINDS
+            if note.kind in LOOP_EVENTS
         ]
     return outcomes, events
 

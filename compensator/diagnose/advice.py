@@ -16,10 +16,10 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import SHORT_PCT
 from compensator.diagnose.deciding import DECIDES, Deciding, PlannedTest
-from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
 from compensator.diagnose.nearest import Near, course_evidence, may_be_near_the_cause, nearest
+from compensator.diagnose.switched import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.trials import Trials
 from compensator.model.effects.hypothesis import DEGC
 from compensator.model.effects.regression import AMBIENT

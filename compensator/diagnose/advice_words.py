@@ -6,7 +6,7 @@ from typing import Any
 
 from compensator.diagnose.advice import Advice, SeenOnce, Unexplained, resembling
 from compensator.diagnose.deciding import SHOWN, PlannedTest
-from compensator.diagnose.events import DAY
+from compensator.diagnose.switched import DAY
 from compensator.model.effects.seen import roughly
 
 #: Tests in sentences; all are in `diagnosis.json`.

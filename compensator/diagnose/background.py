@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import STEP, RandomColumns
-from compensator.diagnose.points import Points, Rest, lags_of_paths
+from compensator.diagnose.points import Points, SlowRest, lags_of_paths
 from compensator.diagnose.refitted_paths import with_fewer_lags
 from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.blocks import FilterBank
@@ -56,14 +56,14 @@ class Regressed:
         What it adds to y on every sample, µm.
     log_evidence : float
         Logarithm of the probability of the data with it.
-    rest : Rest
+    rest : SlowRest
         What it leaves unexplained.
     """
 
     effect: Regression
     added: Vector
     log_evidence: float
-    rest: Rest
+    rest: SlowRest
 
     def times(self, share: float) -> Regressed:
         """Return a share of the response; what is open of it stays as it is."""
@@ -117,7 +117,7 @@ class Background:
         # The sizes of the base's own paths are known apart from those of channels.
         self.is_path = np.arange(len(inputs)) < paths
 
-    def fitted(self, points: Points, explained: Vector, start: Rest) -> Regressed:
+    def fitted(self, points: Points, explained: Vector, start: SlowRest) -> Regressed:
         """Fit to what named effects leave.
 
         Parameters
@@ -126,7 +126,7 @@ class Background:
             Which samples take part.
         explained : numpy.ndarray, shape (points,)
             What the named effects add, µm.
-        start : Rest
+        start : SlowRest
             Where the search of the rest begins.
         """
         return _Problem(self, points, explained).solved(start)
@@ -173,7 +173,7 @@ class _Problem:
         typical = points.typical_rest()
         self.typical_rest = np.log([typical.slow_um, typical.tau_min, typical.start_um])
 
-    def solved(self, start: Rest) -> Regressed:
+    def solved(self, start: SlowRest) -> Regressed:
         """Return the regression with the most probable sizes."""
         sizes = np.where(self.is_path, self.typical_path, self.typical_size - 1.0)
         begin = np.concatenate([np.log([start.slow_um, start.tau_min, start.start_um]), sizes])
@@ -183,7 +183,7 @@ class _Problem:
         found = minimize(self._with_gradient, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return self._result(np.asarray(found.x), -float(found.fun))
 
-    def _rest(self, x: Vector) -> Rest:
+    def _rest(self, x: Vector) -> SlowRest:
         slow_um, tau_min, start_um = np.exp(x[:3]).tolist()
         typical = self.points.typical_rest()
         return dataclasses.replace(typical.without_own_error(), slow_um=slow_um, tau_min=tau_min, start_um=start_um)

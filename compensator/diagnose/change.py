@@ -12,7 +12,7 @@ import numpy as np
 from compensator.arrays import Vector
 
 #: Length of a block, min, and the fewest of them on each side.
-BLOCK_MIN, FEWEST = 30.0, 8
+BLOCK_MIN, FEWEST_BLOCKS = 30.0, 8
 #: A split must be better by so much log-likelihood.
 CHANGED = 5.0
 #: A model was right before if its error varied by less than this part of what it has varied by since.
@@ -41,7 +41,7 @@ def changed_at(t_s: Vector, residual_um: Vector, floor_um: float, *, from_quiet:
     numbers, blocks = np.unique(t_s[known] // (60.0 * BLOCK_MIN), return_inverse=True)
     means = np.bincount(blocks, residual_um[known]) / np.maximum(np.bincount(blocks), 1)
     n = means.size
-    splits = range(FEWEST, n - FEWEST + 1)
+    splits = range(FEWEST_BLOCKS, n - FEWEST_BLOCKS + 1)
     if not splits:
         return None
 

@@ -19,7 +19,7 @@ from compensator.diagnose.evidence import LEAST_VALUES, Evidence
 from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.fit import Fit, fit_terms
 from compensator.diagnose.likelihood import Likelihood, dense, learned_rest
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 
 #: A value so many deviations away from what the others predict is suspected; one so many away is left out.
 SUSPECTED, IMPROBABLE = 3.0, 4.5
@@ -136,7 +136,7 @@ def _alike(missed: Vector, agree_um: float) -> str:
     )
 
 
-def _precision(points: Points, rest: Rest) -> Matrix:
+def _precision(points: Points, rest: SlowRest) -> Matrix:
     """Return the inverse of the values' covariance without effects."""
     table = dense(Likelihood(points, rest))
     return np.asarray(table.T @ table)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.events import DAY, HEAT
 from compensator.diagnose.fit import Fit
 from compensator.diagnose.points import Points
 from compensator.diagnose.record_with_test import HOURS, RecordWithTest, values_within
+from compensator.diagnose.switched import DAY, HEAT
 from compensator.diagnose.trials import REST_H, Trial, Trials
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.seen import roughly

@@ -17,7 +17,7 @@ from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import Advice, advice_of
-from compensator.diagnose.ceiling import Ceiling
+from compensator.diagnose.ceiling import Ceiling, ceiling_of
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of
@@ -30,10 +30,10 @@ from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.named_effects import named_effects, ranked
 from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import Diagnosis, Refused, Remainder, Verdict
+from compensator.diagnose.outcome import Diagnosis, Refused, Remainder
 from compensator.diagnose.prediction import FOLDS
 from compensator.diagnose.trials import Trials
-from compensator.diagnose.verdict import ceiling_of, judged
+from compensator.diagnose.verdict import Judged, judged
 from compensator.diagnose.warning_words import ceiling_in_part, warnings_on
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import Place
@@ -193,22 +193,19 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
     chosen, is_off = searched.chosen, searched.is_off
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     evidence = found.search.evidence
-    few = evidence.is_sparse
     extended, remarks = extended_model(model, chosen)
     deployed = extended is not model
     ceiling = ceiling_of(held_out)
-    verdict, is_explained = judged(chosen, extended, ceiling, is_off=is_off)
-    could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
-    # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
-    hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
+    could_hide = detection_limits(found.selection, found.search.criterion.price) if evidence.is_sparse else None
+    base = judged(chosen, extended, ceiling, could_hide, is_off=is_off)
     advice = None
-    if verdict != "adequate" or hides:
-        advice = _advice(searched, ceiling, is_explained=is_explained or hides)
+    if base.verdict != "adequate":
+        advice = _advice(searched, ceiling, is_explained=base.nothing_left)
     refused = _refused(chosen)
     left = evidence.left(found.whole)
     before = np.where(evidence.used, evidence.residual - found.paths, 0.0)
     return Diagnosis(
-        verdict="unexplained" if hides or chosen.reverses_path else verdict,
+        verdict=base.verdict,
         effects=effects,
         held_out=how_held_out(evidence, () if refused else _of_no_model(effects)),
         model=extended,
@@ -225,7 +222,7 @@ def _result(model: ThermalModel, searched: _Searched) -> Diagnosis:
         warnings=(
             *searched.left_out,
             *remarks,
-            *_paths_kept(evidence, verdict, deployed=deployed, is_off=is_off),
+            *_paths_kept(evidence, base, deployed=deployed, is_off=is_off),
             *warnings_on(chosen, deployed=deployed),
             *ceiling_in_part(evidence.context),
         ),
@@ -278,9 +275,9 @@ def _evidence(model: ThermalModel, runs: Sequence[Run], options: DiagnosisOption
     return evidence.with_free_paths() if evidence.is_far_off and not options.keep_paths else evidence
 
 
-def _paths_kept(evidence: Evidence, verdict: Verdict, *, deployed: bool, is_off: bool) -> list[Remark]:
+def _paths_kept(evidence: Evidence, base: Judged, *, deployed: bool, is_off: bool) -> list[Remark]:
     """Return the remark that paths were kept which would be fitted anew, where something is missing."""
-    if verdict == "adequate" or (evidence.free_paths and deployed) or not evidence.is_far_off:
+    if base.verdict == "adequate" or base.hides or (evidence.free_paths and deployed) or not evidence.is_far_off:
         return []
     left_um = evidence.model.held_out_rms_um or 0.0
     why = "nothing came of paths fitted anew, so its own were kept" if is_off else "its paths were kept"

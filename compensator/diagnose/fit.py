@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, factor_of, factored, learned_rest, log_det_of, solution
-from compensator.diagnose.points import Points, Rest, raw_columns
+from compensator.diagnose.points import Points, SlowRest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place, place_in_words
 
@@ -91,7 +91,7 @@ class Fit:
     added: Vector
 
     @property
-    def rest(self) -> Rest:
+    def rest(self) -> SlowRest:
         """What no effect explains."""
         return self.likelihood.rest
 
@@ -263,7 +263,7 @@ def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: i
 
 def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix], jacobian: Matrix) -> Fit:
     likelihood, (residual, amplitudes, factor) = problem.likelihood, solved
-    parts, rest = problem.parts(x), iter(amplitudes.tolist())
+    parts, amplitudes_left = problem.parts(x), iter(amplitudes.tolist())
     terms, columns, fixed = [], [np.zeros((likelihood.points.count, 0))], np.zeros(likelihood.points.count)
     for hypothesis, part in zip(problem.hypotheses, parts, strict=True):
         own: tuple[float, ...] = ()
@@ -272,7 +272,8 @@ def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix],
         else:
             columns.append(part.columns)
             own = tuple(
-                a * s for a, s in zip(itertools.islice(rest, part.scale.size), part.scale.tolist(), strict=True)
+                a * s
+                for a, s in zip(itertools.islice(amplitudes_left, part.scale.size), part.scale.tolist(), strict=True)
             )
         terms.append(Term(hypothesis=hypothesis, values=part.values, amplitudes=own))
     table = np.concatenate(columns, axis=1)

@@ -46,14 +46,14 @@ class Foresight:
     behind_min: float = 0.0
 
 
-def foreseeing(fit: Fit, known: Foresight | None = None) -> tuple[Fit, Foresight | None]:
+def foreseeing(fit: Fit, known: Foresight | None) -> tuple[Fit, Foresight | None]:
     """Return a fit whose late T_Q says how the drive moves, if there is one, and how.
 
     Parameters
     ----------
     fit : Fit
         What was found.
-    known : Foresight, optional
+    known : Foresight or None
         That of all data, where something is held out: no value of Y takes part in it.
     """
     late, evidence = late_term(fit), fit.likelihood.points.evidence

@@ -15,7 +15,7 @@ from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.outcome import Step
 from compensator.diagnose.own_error import own_error_alone
-from compensator.diagnose.points import Rest
+from compensator.diagnose.points import SlowRest
 from compensator.diagnose.prediction import FOLDS, Nuisances, left_of_block, zeros_known
 from compensator.diagnose.scan import Grid
 from compensator.display import listed
@@ -145,7 +145,7 @@ def _predictions(
     begins_warm: bool,
     leaves_late: bool,
     of_time: Vector,
-    rests: tuple[Rest, Rest],
+    rests: tuple[SlowRest, SlowRest],
 ) -> _Predictions:
     search = partial(findings_of, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
     found = as_begun(search(seen), search) if begins_warm else search(seen)

@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
-from compensator.diagnose.points import REST_FOLDS, Points, Rest
+from compensator.diagnose.points import REST_FOLDS, Points, SlowRest
 from compensator.diagnose.whitening import Whitening
 
 #: Furthest that the search of the rest goes, in e-folds.
@@ -91,7 +91,7 @@ class Likelihood:
     ----------
     points : Points
         The evidence.
-    rest : Rest
+    rest : SlowRest
         What no effect explains.
 
     Attributes
@@ -102,7 +102,7 @@ class Likelihood:
         Logarithm of the determinant of the covariance without effects.
     """
 
-    def __init__(self, points: Points, rest: Rest) -> None:
+    def __init__(self, points: Points, rest: SlowRest) -> None:
         self.points, self.rest = points, rest
         self._whitening = Whitening(points, rest)
         self._random = self._whitening.of(points.random(rest))
@@ -140,7 +140,7 @@ class Likelihood:
         return white, np.asarray(taken)
 
 
-def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest) -> Rest:
+def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: SlowRest) -> SlowRest:
     """Return the rest with which data are most probable, given what effects may add.
 
     Parameters
@@ -151,7 +151,7 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest) ->
         Scaled columns of effects.
     fixed : numpy.ndarray, shape (points,)
         What effects without a free amplitude add, µm.
-    start : Rest
+    start : SlowRest
         Where to begin; its own error is kept.
     """
     unit = dataclasses.replace(start, start_um=1.0, fast_um=1.0)
@@ -188,7 +188,7 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest) ->
     return start.with_logs(at)
 
 
-def rest_without_effects(points: Points) -> Rest:
+def rest_without_effects(points: Points) -> SlowRest:
     """Return the rest with which data are most probable if nothing acts."""
     nothing = np.zeros(points.count)
     return learned_rest(points, np.zeros((points.count, 0)), nothing, points.typical_rest())

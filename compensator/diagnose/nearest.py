@@ -22,7 +22,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.diagnose.background import LAGS_MIN, RECENT_MIN
 from compensator.diagnose.fit import Fit, Term, fit_terms
 from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.model.effects.blocks import FilterBank
 from compensator.model.effects.hypothesis import DEGC
 from compensator.model.effects.regression import AMBIENT
@@ -66,14 +66,14 @@ def may_be_near_the_cause(term: Term) -> bool:
     return channel.endswith(DEGC) if channel else bool(path)
 
 
-def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
+def nearest(fit: Fit, unexplained: SlowRest) -> tuple[Near, ...]:
     """Rank the logged channels by how near they come to what a fit leaves and what temperatures explain in it.
 
     Parameters
     ----------
     fit : Fit
         All effects found.
-    unexplained : Rest
+    unexplained : SlowRest
         The rest where no effect explains anything: where the search of it begins.
 
     Returns
@@ -99,14 +99,14 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     return tuple(dataclasses.replace(near, by_chance=by_chance) for near in found)
 
 
-def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
+def course_evidence(fit: Fit, unexplained: SlowRest, course: Vector) -> float:
     """Return what a channel with exactly some course would add to the evidence of what a fit leaves without it.
 
     Parameters
     ----------
     fit : Fit
         All effects found.
-    unexplained : Rest
+    unexplained : SlowRest
         The rest where no effect explains anything.
     course : numpy.ndarray, shape (n,)
         On every sample, µm.
@@ -123,7 +123,7 @@ class _Ranking:
     A smaller rest would take what a channel does not explain for more than it is, and rank by that.
     """
 
-    def __init__(self, base: Fit, unexplained: Rest) -> None:
+    def __init__(self, base: Fit, unexplained: SlowRest) -> None:
         self._points = base.likelihood.points
         start = dataclasses.replace(unexplained, own_um=base.rest.own_um)
         self._likelihood = likelihood = Likelihood(

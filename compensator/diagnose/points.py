@@ -37,7 +37,7 @@ FORM_ERROR = (0.02, 0.1)
 #: The zero of a run is free: this many times the spread of the deformation.
 ZERO_TIMES = 10.0
 #: Typical size of an initial state, as a share of the spread of the deformation.
-START_SHARE = 0.1
+STATE_SHARE = 0.1
 #: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
 SLOW_SHARE = 0.03
 #: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant, the
@@ -46,7 +46,7 @@ REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
+class SlowRest:
     """What no effect explains.
 
     Parameters
@@ -76,12 +76,12 @@ class Rest:
         """Logarithms of what is learned: noise, slow rest, its time constant, initial state, fast error, shape (5,)."""
         return np.log([self.noise_um, self.slow_um, self.tau_min, self.start_um, max(self.fast_um, 1e-9)])
 
-    def with_logs(self, logs: Vector) -> Rest:
+    def with_logs(self, logs: Vector) -> SlowRest:
         """Return the rest with other values of what is learned."""
         noise_um, slow_um, tau_min, start_um, fast_um = np.exp(logs).tolist()
-        return Rest(noise_um, slow_um, tau_min, start_um, fast_um, self.own_um, self.forms)
+        return SlowRest(noise_um, slow_um, tau_min, start_um, fast_um, self.own_um, self.forms)
 
-    def without_own_error(self) -> Rest:
+    def without_own_error(self) -> SlowRest:
         """Return the rest for a base whose paths are exact."""
         return dataclasses.replace(self, fast_um=0.0, own_um=0.0, forms=())
 
@@ -119,7 +119,7 @@ class Points:
     spread_um, own_um : float
         Standard deviation of the deformation, and the own error of the base's paths, µm.
     typical_logs : numpy.ndarray, shape (5,)
-        `Rest.logs` as it is expected before the data are seen.
+        `SlowRest.logs` as it is expected before the data are seen.
     zeros, starts_of_modes, fast, slow : numpy.ndarray, shape (points, ·)
         Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
     """
@@ -176,7 +176,7 @@ class Points:
         elif not self.is_exact:
             noise_um = math.hypot(noise_um, self.own_um)
         slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
-        return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, START_SHARE * self.spread_um, self.own_um])
+        return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, STATE_SHARE * self.spread_um, self.own_um])
 
     def _alike(self) -> list[tuple[int, int]]:
         """Return stretches of points with one noise and one time to the next; the last of a run is by itself."""
@@ -229,16 +229,16 @@ class Points:
         scale = scale / math.sqrt(together)
         return points * scale, scale
 
-    def typical_rest(self) -> Rest:
+    def typical_rest(self) -> SlowRest:
         """Return a rest as it is expected before the data are seen."""
-        return Rest(0.0, 0.0, 0.0, 0.0, 0.0, self.own_um).with_logs(self.typical_logs)
+        return SlowRest(0.0, 0.0, 0.0, 0.0, 0.0, self.own_um).with_logs(self.typical_logs)
 
-    def with_forms_of(self, rest: Rest, sizes_um: Mapping[str, float]) -> Rest:
+    def with_forms_of(self, rest: SlowRest, sizes_um: Mapping[str, float]) -> SlowRest:
         """Return a rest with the errors that effects have whose form is not quite theirs.
 
         Parameters
         ----------
-        rest : Rest
+        rest : SlowRest
             Where the other values come from.
         sizes_um : mapping of str to float
             Standard deviation of what each channel adds by effects, µm; of the base's paths under an empty name.
@@ -247,12 +247,12 @@ class Points:
         forms = tuple((channel, share * size) for channel, size in sizes_um.items() if channel)
         return dataclasses.replace(rest, own_um=math.hypot(self.own_um, share * sizes_um.get("", 0.0)), forms=forms)
 
-    def zeros_and_starts(self, rest: Rest) -> Matrix:
+    def zeros_and_starts(self, rest: SlowRest) -> Matrix:
         """Return the first columns of `random`, zeros and initial states, on every sample."""
         zeros_um = ZERO_TIMES * self.spread_um * self.evidence.zeros
         return np.concatenate([zeros_um, rest.start_um * self.evidence.decays], axis=1)
 
-    def random(self, rest: Rest) -> Matrix:
+    def random(self, rest: SlowRest) -> Matrix:
         """Return columns whose weights are unknown with standard deviation 1.
 
         Zeros, initial states, fast and slow own error, errors of form.
@@ -260,7 +260,7 @@ class Points:
         starts, forms = rest.start_um * self.starts_of_modes, [size * self.form(name) for name, size in rest.forms]
         return np.concatenate([self.zeros, starts, rest.fast_um * self.fast, rest.own_um * self.slow, *forms], axis=1)
 
-    def made_of(self, rest: Rest) -> list[tuple[str, Matrix]]:
+    def made_of(self, rest: SlowRest) -> list[tuple[str, Matrix]]:
         """Return what the columns of `random` behind the initial states are made of, in their order.
 
         For each input its name, a path or a channel, and the gains behind `lags_of_paths`, shape (lags, columns).
@@ -279,7 +279,7 @@ class Points:
             self._forms[channel] = self._distinct(table, np.eye(lags.size))
         return self._forms[channel]
 
-    def log_prior(self, rest: Rest) -> float:
+    def log_prior(self, rest: SlowRest) -> float:
         """Return the logarithm of the prior of a rest."""
         return -0.5 * float(np.sum(((rest.logs - self.typical_logs) / REST_FOLDS) ** 2))
 

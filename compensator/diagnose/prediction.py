@@ -11,7 +11,7 @@ from compensator.arrays import Mask, Vector, rms_of
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, fit_terms, settled, summed
 from compensator.diagnose.likelihood import Likelihood, RandomColumns
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.whitening import Whitening
 
 #: Blocks that are held out, one after another.
@@ -68,12 +68,12 @@ class Nuisances:
     ----------
     points : Points
         The part.
-    rest : Rest
+    rest : SlowRest
         What no effect explains, of all data: how far initial states are from rest, and how many samples count. A part
         that does not see where a run begins says nothing of that.
     """
 
-    def __init__(self, points: Points, rest: Rest) -> None:
+    def __init__(self, points: Points, rest: SlowRest) -> None:
         self._points, self._whitening = points, Whitening(points, rest)
         self._table = points.zeros_and_starts(rest)
         self._white = self._whitening.of(points.averaged(self._table))

@@ -20,7 +20,7 @@ from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term
 from compensator.diagnose.nuisances import decays_of
-from compensator.diagnose.points import Points, Rest, raw_columns
+from compensator.diagnose.points import Points, SlowRest, raw_columns
 from compensator.diagnose.trials import Trial
 from compensator.diagnose.whitening import Whitening
 
@@ -81,7 +81,7 @@ class RecordWithTest:
         _, table, precision = self._prediction(fit, fit.rest)
         return expected_change(d, table, precision, self.ends)
 
-    def _prediction(self, fit: Fit, rest: Rest) -> tuple[Vector, Matrix, Matrix]:
+    def _prediction(self, fit: Fit, rest: SlowRest) -> tuple[Vector, Matrix, Matrix]:
         """Return the mean of the test, columns of what stays unknown in it, and their precision after the record."""
         known = self._known.get(id(fit))
         if known is None or known[0] is not fit:

@@ -10,7 +10,7 @@ import numpy as np
 from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.fit import Fit, Start
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.model.effects.hypothesis import Hypothesis
 
 
@@ -77,12 +77,12 @@ class Scan:
         self._columns = np.concatenate(tables, axis=1)
         self._fixed = np.array([not hypothesis.amplitudes for hypothesis, _ in self._starts], dtype=bool)
 
-    def ranked(self, rest: Rest, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
+    def ranked(self, rest: SlowRest, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
         """Rank the hypotheses whose places are free by what their best grid point adds to the evidence.
 
         Parameters
         ----------
-        rest : Rest
+        rest : SlowRest
             What no effect explains.
         fit : Fit
             What leaves the residual.

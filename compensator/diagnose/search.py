@@ -18,7 +18,7 @@ from compensator.diagnose.criterion import MOSTLY, Criterion
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, rest_without_effects
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.prediction import Folds
 from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.standard_errors import deviations
@@ -150,9 +150,7 @@ class Search:
             undecided=() if best.terms else undecided,
         )
 
-    def _grown(
-        self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()
-    ) -> tuple[Fit, tuple[Fit, ...]]:
+    def _grown(self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place]) -> tuple[Fit, tuple[Fit, ...]]:
         """Add one effect after another while each is worth its cost; return what few values do not decide, too.
 
         Parameters
@@ -224,7 +222,7 @@ class Search:
 
     # ------------------------------------------------------------------ steps
 
-    def _views(self, fit: Fit) -> list[Rest]:
+    def _views(self, fit: Fit) -> list[SlowRest]:
         """Return the rests with which effects are proposed: as it is, small, and between."""
         small = min(fit.rest.slow_um, max(self.evidence.probe_um, self.points.own_um))
         views = [fit.rest]
@@ -278,7 +276,7 @@ class Search:
         ]
         return max(fits, key=lambda one: one.log_evidence).terms[-1].start
 
-    def _exchanged(self, fit: Fit, *, keep_last: bool = True, apart_from: frozenset[Place] = frozenset()) -> Fit:
+    def _exchanged(self, fit: Fit, *, keep_last: bool = True, apart_from: frozenset[Place]) -> Fit:
         """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.
 
         Parameters
@@ -317,7 +315,7 @@ class Search:
             fit = fewer[best]
         return fit
 
-    def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
+    def _sources(self, rest: SlowRest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
         """Yield a source that no channel shows, where it may compete with the effects found.
 
         It begins when `found` has the effects of the scan: a source that cannot win is not refined.

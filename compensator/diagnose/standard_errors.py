@@ -54,9 +54,7 @@ def deviations(fit: Fit) -> list[tuple[float, float]]:
     return found
 
 
-def std_factors(
-    fit: Fit, terms: Sequence[Term], *, beside_own_error: bool = False
-) -> list[tuple[tuple[float, ...], ...]]:
+def std_factors(fit: Fit, terms: Sequence[Term], *, beside_own_error: bool) -> list[tuple[tuple[float, ...], ...]]:
     """Return the rows of `Effect.std_factor` of each effect: how all of them may differ together.
 
     The directions are those that move y most in this record, so that few rows say nearly all.

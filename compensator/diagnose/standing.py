@@ -6,61 +6,14 @@ explains nothing. A run that took no part has the last word.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT
-from compensator.diagnose.noise import VERDICT_TIMES
+from compensator.diagnose.verdict import is_confirmed
 from compensator.display import listed
 from compensator.model.effects.hypothesis import DEGC
 from compensator.model.effects.input import Input
 from compensator.model.effects.unobserved import Unobserved
-
-#: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
-#: mean square about the mean there: more is gone than stays.
-CONFIRMS = 0.5
-
-
-def is_contradicted(found: Mapping[str, Any]) -> bool:
-    """Whether the extended model is worse than the base model on data that took no part in the search.
-
-    Parameters
-    ----------
-    found : mapping
-        Content of `diagnosis.json`.
-    """
-    return any(
-        EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in _fresh(found.get("free_run", []))
-    )
-
-
-def is_confirmed(free_run: Sequence[Mapping[str, Any]], noise_um: float) -> bool:
-    """Whether what was deployed helps on every run that took no part; true where none says anything.
-
-    A run on which the base model leaves noise says nothing, nor does one on which both models are the same.
-
-    Parameters
-    ----------
-    free_run : sequence of mapping
-        As in `diagnosis.json`.
-    noise_um : float
-        What the sensors' noise makes of the residual, µm.
-    """
-    for one in _fresh(free_run):
-        base, own = one[BASE]["rms_about_mean_um"], one.get(EXTENDED, one[BASE])["rms_about_mean_um"]
-        is_noise = max(base, own) <= VERDICT_TIMES * noise_um
-        if own != base and not is_noise and own**2 > CONFIRMS * base**2:
-            return False
-    return True
-
-
-def _fresh(free_run: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    return [one["scores"] for one in free_run if one["role"] == HELD_OUT]
-
-
-def verdict_of(verdict: str, free_run: Sequence[Mapping[str, Any]], noise_um: float) -> str:
-    """Return a verdict in one word after the runs that took no part: what they do not confirm is not `explained`."""
-    return "partly_explained" if verdict == "explained" and not is_confirmed(free_run, noise_um) else verdict
 
 
 def undecided(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -80,8 +33,8 @@ def is_hidden(found: Mapping[str, Any]) -> bool:
 
 def held_by_the_base(found: Mapping[str, Any]) -> list[str]:
     """Return the temperatures that act beside the base's own error: it has what heat and ambient do by them already."""
-    rest = found.get("remainder") or {}
-    if not rest.get("belongs") or rest.get("instead"):
+    remainder = found.get("remainder") or {}
+    if not remainder.get("belongs") or remainder.get("instead"):
         return []
     channels = [effect.get("channel") or "" for effect in found["effects"] if effect["kind"] == Input.kind]
     return [channel for channel in channels if channel.endswith(DEGC)]
@@ -126,16 +79,16 @@ def _has_test(found: Mapping[str, Any]) -> bool:
 
 def _by_the_remainder(found: Mapping[str, Any]) -> str:
     """Return what the named effects explain and what the remainder corrects; empty where it has no part in it."""
-    rest, fit = found.get("remainder"), found.get("fit")
-    if not rest or not rest["deployed"] or not fit or found["verdict"] == "explained":
+    remainder, fit = found.get("remainder"), found.get("fit")
+    if not remainder or not remainder["deployed"] or not fit or found["verdict"] == "explained":
         return ""
     left = f"of {fit['before_um']:.2f} µm rms in the fit, {fit['named_um']:.2f} is left by it"
-    if rest.get("instead") and is_hidden(found):
+    if remainder.get("instead") and is_hidden(found):
         return (
             f"Something acts that no channel shows by itself. All channels together make up for it: the remainder, "
             f"which explains nothing, leaves {fit['after_um']:.2f} of {fit['before_um']:.2f} µm rms in the fit."
         )
-    if rest.get("instead"):
+    if remainder.get("instead"):
         return (
             f"What is named resembles the cause most: {left}. A regularised response does better: the remainder, which "
             f"explains nothing, is deployed in its place and leaves {fit['after_um']:.2f}."

@@ -13,23 +13,16 @@ from compensator.arrays import rms_of
 from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
-from compensator.diagnose.ceiling import (
-    Ceiling,
-    ceiling,
-    explained,
-    falls_short,
-    found_rms,
-    lowers,
-    named_rms,
-    remainder,
-)
+from compensator.diagnose.ceiling import Ceiling
+from compensator.diagnose.ceiling_words import ceiling, explained, falls_short, found_rms, named_rms
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import free_run_sentence, off_zero
+from compensator.diagnose.free_run_words import free_run_sentence, off_zero
 from compensator.diagnose.outcome import Diagnosis, Remainder
-from compensator.diagnose.standing import verdict_of
+from compensator.diagnose.remainder_words import lowers, remainder
 from compensator.diagnose.standing import words as of_the_effects
+from compensator.diagnose.verdict import verdict_of
 from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.simulation import SCORE_HEAD, Scores
@@ -279,8 +272,8 @@ def _words(found: Mapping[str, Any]) -> str:
     elif _foretells_less(found):
         words = _FORETELLS_LESS
     elif _without_a_name(found):
-        rest = found.get("remainder") or {}
-        words = _OWN_PATHS if rest.get("belongs") and lowers(rest) else _WITHOUT_A_NAME
+        added = found.get("remainder") or {}
+        words = _OWN_PATHS if added.get("belongs") and lowers(added) else _WITHOUT_A_NAME
     return words
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.fit import Fit, Start
 from compensator.diagnose.likelihood import Likelihood, dense
-from compensator.diagnose.points import Rest
+from compensator.diagnose.points import SlowRest
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.hypothesis import Free, Hypothesis
 from compensator.model.effects.unobserved import Unobserved
@@ -34,12 +34,12 @@ START_SHARE = 0.01
 AT_ONCE = 5.0
 
 
-def switchings(rest: Rest, fit: Fit, rival: float = 0.0) -> Start | None:
+def switchings(rest: SlowRest, fit: Fit, rival: float) -> Start | None:
     """Find steps through a common lag that what a fit leaves may be made of, one after another.
 
     Parameters
     ----------
-    rest : Rest
+    rest : SlowRest
         What else there is.
     fit : Fit
         What leaves the residual.
@@ -57,7 +57,7 @@ def switchings(rest: Rest, fit: Fit, rival: float = 0.0) -> Start | None:
 class _Pursuit:
     """Orthogonal matching pursuit of steps in what a fit leaves, beside a rest."""
 
-    def __init__(self, rest: Rest, fit: Fit) -> None:
+    def __init__(self, rest: SlowRest, fit: Fit) -> None:
         points = fit.likelihood.points
         likelihood = Likelihood(points, rest)
         self._evidence, self._averaged = points.evidence, points.averaged

@@ -18,8 +18,8 @@ from compensator.arrays import Matrix, Vector
 from compensator.data.runs import Run
 from compensator.diagnose.background import LAGS_MIN
 from compensator.diagnose.base_run import signals_of
-from compensator.diagnose.events import HEAT, swings
 from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.switched import HEAT, swings
 from compensator.model.effects.blocks import FilterBank, Lag
 from compensator.model.effects.hypothesis import DEGC, Place
 from compensator.model.effects.input import unit_of

@@ -1,25 +1,57 @@
-"""The verdict on a base model from the data that were searched, and what all channels could explain."""
+"""The verdict on a base model: by the data that were searched, and after the runs that took no part."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from compensator.arrays import Vector, rms_of
 from compensator.diagnose.ceiling import Ceiling
 from compensator.diagnose.deployment import Deployment, is_adequate
-from compensator.diagnose.held_out import HeldOut
+from compensator.diagnose.detection_limit import DetectionLimits
+from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import Verdict
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 
+#: A run that took no part confirms effects if the extended model leaves no more than this share of the base model's
+#: mean square about the mean there: more is gone than stays.
+CONFIRMS = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """The verdict on a base model by the data that were searched.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        In one word.
+    nothing_left : bool
+        Whether nothing is left to look for in the residual.
+    hides : bool
+        Whether the base is adequate but for what could act without being seen.
+    """
+
+    verdict: Verdict
+    nothing_left: bool
+    hides: bool
+
 
 def judged(
-    chosen: Deployment, extended: ThermalModel, ceiling: Ceiling | None, *, is_off: bool
-) -> tuple[Verdict, bool]:
-    """Return the verdict in one word, and whether nothing is left to look for.
+    chosen: Deployment,
+    extended: ThermalModel,
+    ceiling: Ceiling | None,
+    could_hide: DetectionLimits | None,
+    *,
+    is_off: bool,
+) -> Judged:
+    """Return the verdict by the data that were searched; `verdict_of` asks the runs that took no part.
 
     "Explained" is said of the named effects alone; what the remainder corrects beside them is not looked for, but has
     no name. What the engine cannot know of a late T_Q counts as noise.
@@ -32,9 +64,23 @@ def judged(
         The model with it.
     ceiling : Ceiling or None
         What all channels could explain.
+    could_hide : DetectionLimits or None
+        Where Y was measured now and then: how much could act without being seen.
     is_off : bool
         Whether the base is far off, and its paths were kept because nothing came of others.
     """
+    verdict, nothing_left = _of_what_was_found(chosen, extended, ceiling, is_off=is_off)
+    # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
+    hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
+    if hides or chosen.reverses_path:
+        verdict = "unexplained"
+    return Judged(verdict=verdict, nothing_left=nothing_left or hides, hides=hides)
+
+
+def _of_what_was_found(
+    chosen: Deployment, extended: ThermalModel, ceiling: Ceiling | None, *, is_off: bool
+) -> tuple[Verdict, bool]:
+    """Return the verdict in one word, and whether nothing is left to look for; parameters as in `judged`."""
     found, effects, held_out = chosen.found, chosen.effects, chosen.held_out
     evidence = found.search.evidence
     observed = [term.hypothesis.effect.observed for term in found.terms]
@@ -72,13 +118,43 @@ def judged(
     return ("explained" if nothing_left and by_names and not is_missed else "partly_explained"), nothing_left
 
 
-def ceiling_of(held_out: HeldOut) -> Ceiling | None:
-    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
-    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
-    if linear >= before:
-        return None
-    return Ceiling(
-        rms_um=float(np.sqrt(linear)),
-        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
-        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
+def verdict_of(verdict: str, free_run: Sequence[Mapping[str, Any]], noise_um: float) -> str:
+    """Return a verdict in one word after the runs that took no part: what they do not confirm is not `explained`."""
+    return "partly_explained" if verdict == "explained" and not is_confirmed(free_run, noise_um) else verdict
+
+
+def is_contradicted(found: Mapping[str, Any]) -> bool:
+    """Whether the extended model is worse than the base model on data that took no part in the search.
+
+    Parameters
+    ----------
+    found : mapping
+        Content of `diagnosis.json`.
+    """
+    return any(
+        EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in _fresh(found.get("free_run", []))
     )
+
+
+def is_confirmed(free_run: Sequence[Mapping[str, Any]], noise_um: float) -> bool:
+    """Whether what was deployed helps on every run that took no part; true where none says anything.
+
+    A run on which the base model leaves noise says nothing, nor does one on which both models are the same.
+
+    Parameters
+    ----------
+    free_run : sequence of mapping
+        As in `diagnosis.json`.
+    noise_um : float
+        What the sensors' noise makes of the residual, µm.
+    """
+    for one in _fresh(free_run):
+        base, own = one[BASE]["rms_about_mean_um"], one.get(EXTENDED, one[BASE])["rms_about_mean_um"]
+        is_noise = max(base, own) <= VERDICT_TIMES * noise_um
+        if own != base and not is_noise and own**2 > CONFIRMS * base**2:
+            return False
+    return True
+
+
+def _fresh(free_run: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return [one["scores"] for one in free_run if one["role"] == HELD_OUT]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
 from compensator.arrays import Matrix
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 
 #: So many columns are whitened with all of them at once.
 MANY = 400
@@ -21,11 +21,11 @@ class Whitening:
     ----------
     points : Points
         Which points are used, and where runs begin.
-    rest : Rest
+    rest : SlowRest
         Noise, and size and time constant of the slow rest.
     """
 
-    def __init__(self, points: Points, rest: Rest) -> None:
+    def __init__(self, points: Points, rest: SlowRest) -> None:
         stationary = (rest.slow_um / rest.noise_um) ** 2
         # What is left of a slow process from each point to the next; nothing from run to run.
         phis = points.decays(rest.tau_min)

@@ -39,7 +39,7 @@ NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Output:
+class AxisFit:
     """The data of one axis and the fit of it alone.
 
     Parameters
@@ -174,7 +174,7 @@ def _with_common_errors(fits: Sequence[OutputErrorFit]) -> list[OutputErrorFit]:
 
 
 def share(
-    outputs: Mapping[str, Output], *, period_s: float, folds: int, progress: Progress = unreported
+    outputs: Mapping[str, AxisFit], *, period_s: float, folds: int, progress: Progress = unreported
 ) -> list[Shared]:
     """Find the axes that share their time constants, where the data do not contradict.
 
@@ -182,7 +182,7 @@ def share(
 
     Parameters
     ----------
-    outputs : mapping of str to Output
+    outputs : mapping of str to AxisFit
         Data and fit of each axis alone.
     period_s : float
         Sample period, s.
@@ -223,13 +223,13 @@ def share(
     return [one for one in found if one is not None]
 
 
-def _gain(shared: Shared, outputs: Mapping[str, Output]) -> float:
+def _gain(shared: Shared, outputs: Mapping[str, AxisFit]) -> float:
     """Return by what factor the held-out errors become smaller, as the mean of its logarithms."""
     ratios = [math.log(outputs[axis].alone.rms / one.rms) for axis, one in shared.candidates.items()]
     return float(np.mean(ratios))
 
 
-def _shared(outputs: Mapping[str, Output], period_s: float, folds: int) -> Shared | None:
+def _shared(outputs: Mapping[str, AxisFit], period_s: float, folds: int) -> Shared | None:
     """Fit axes together with the best of the structures that they have alone; None where the data contradict."""
     found = []
     for structure in {str(one.alone.structure): one.alone.structure for one in outputs.values()}.values():
@@ -246,7 +246,7 @@ def _agrees(together: TriedStructure, alone: TriedStructure) -> bool:
     return together.supported and together.rms <= (1.0 + NEGLIGIBLE) * alone.rms
 
 
-def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: float, folds: int) -> Shared:
+def _candidates(outputs: Mapping[str, AxisFit], structure: Structure, period_s: float, folds: int) -> Shared:
     """Fit axes together with one structure; with their errors on held-out blocks."""
     each = list(outputs.values())
     structures = [dataclasses.replace(structure, prior=one.alone.structure.prior) for one in each]
@@ -278,7 +278,7 @@ def _candidates(outputs: Mapping[str, Output], structure: Structure, period_s: f
 
 
 def calibrated_together(
-    calibrations: Mapping[str, Calibration], *, progress: Progress = unreported
+    calibrations: Mapping[str, Calibration], *, progress: Progress
 ) -> tuple[dict[str, Calibration], tuple[tuple[str, ...], ...]]:
     """Return the calibrations of all axes with common time constants where the data permit, and who has them.
 
@@ -290,7 +290,7 @@ def calibrated_together(
         As `share`.
     """
     outputs = {
-        axis: Output(
+        axis: AxisFit(
             segments=one.deformation.segments,
             fit=one.deformation.main,
             alone=next(c for c in one.deformation.candidates if c.chosen),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.identify.calibration import Calibration
-from compensator.identify.comparison import Row
+from compensator.identify.coefficients import Row
 from compensator.identify.criticism import Criticism
 from compensator.model.free_run import NOTHING, FreeRunErrors, in_words, table_of
 from compensator.model.simulation import SCORE_HEAD
@@ -122,7 +122,7 @@ def share_left(errors: Mapping[str, Any]) -> float:
     return float(errors["folds_rms_um"] / errors["parts"][0]["no_compensation_rms_um"])
 
 
-class Estimate(NamedTuple):
+class EstimatedParameter(NamedTuple):
     """A parameter: description, value with standard error (0: given), and unit."""
 
     label: str
@@ -131,15 +131,15 @@ class Estimate(NamedTuple):
     unit: str
 
 
-def estimates(criticism: Criticism) -> dict[str, Estimate]:
+def estimates(criticism: Criticism) -> dict[str, EstimatedParameter]:
     """Return gains at rest and time constants by name, such as `dtf_gain_um_per_w`, `dtf_tau_1_min`."""
     found = {}
     for path in criticism.paths:
         key, unit = path.name.lower(), path.unit.lower().replace("/", "_per_")
         shown = path.unit.replace("um", "µm")
-        found[f"{key}_gain_{unit}"] = Estimate(f"{path.name}: gain at rest", path.gain, path.gain_std, shown)
+        found[f"{key}_gain_{unit}"] = EstimatedParameter(f"{path.name}: gain at rest", path.gain, path.gain_std, shown)
         for i, (tau, std) in enumerate(zip(path.taus_min, path.taus_std_min, strict=True), start=1):
-            found[f"{key}_tau_{i}_min"] = Estimate(f"{path.name}: time constant {i}", tau, std, "min")
+            found[f"{key}_tau_{i}_min"] = EstimatedParameter(f"{path.name}: time constant {i}", tau, std, "min")
     return found
 
 

@@ -36,9 +36,7 @@ class CorrectedRun:
     believed: Indices
 
 
-def simulate_corrected(
-    model: ThermalModel, record: SampledRecord, y_std_um: Vector, *, source: str = ""
-) -> CorrectedRun:
+def simulate_corrected(model: ThermalModel, record: SampledRecord, y_std_um: Vector, *, source: str) -> CorrectedRun:
     """Run a model over a record; each row is corrected by the measured values of earlier rows.
 
     Before the first measured value the model runs free, from 0. From there on the standard deviation has what the

@@ -107,7 +107,7 @@ def simulate(
     return result
 
 
-def engine_at_start(model: ThermalModel, record: SampledRecord, source: str = "") -> tuple[Engine, int]:
+def engine_at_start(model: ThermalModel, record: SampledRecord, source: str) -> tuple[Engine, int]:
     """Return the engine at rest, and the first sample with both temperatures, which is its reference.
 
     Raises

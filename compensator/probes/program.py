@@ -13,8 +13,7 @@ from compensator.probes.handled import Handled
 from compensator.probes.linuxcnc import ProbeFile
 from compensator.probes.printed import PrintedProbes
 from compensator.probes.probe import Probe, ProbeSink
-from compensator.probes.reports import Report
-from compensator.probes.sender import Sender
+from compensator.probes.sender import ProbeQueue
 from compensator.probes.settings import ProbeSettings
 from compensator.probes.stream import Stream
 from compensator.receiver.applied_record import applied_at
@@ -24,7 +23,7 @@ log = logging.getLogger("compensator")
 _MARGIN_S = 86400.0
 
 
-async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *, report: Report = log.info) -> None:
+async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event) -> None:
     """Read all sources and send what they yield, until `stop` is set.
 
     Parameters
@@ -35,8 +34,6 @@ async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *
         Where probes go.
     stop : asyncio.Event
         Ends it.
-    report : callable, optional
-        Called with a line for each probe and each line that is no probe; the log by default.
 
     Raises
     ------
@@ -44,7 +41,7 @@ async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *
         If the state file cannot be read.
     """
     service = settings.service
-    sender = Sender(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=report)
+    sender = ProbeQueue(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=log.info)
 
     def applied(time_utc_ns: int) -> float | None:
         return applied_at(Path(service.applied_file), time_utc_ns) if service.applied_file else None
@@ -63,7 +60,7 @@ async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *
                 handled,
                 sender.submit,
                 applied,
-                report,
+                log.info,
                 send_within_s=within_s,
                 has_room=sender.has_room,
             )
@@ -71,10 +68,10 @@ async def serve(settings: ProbeSettings, sink: ProbeSink, stop: asyncio.Event, *
             runs.append(watched.run(stop))
     runs.append(sender.run(stop))
     for dprnt in settings.dprnt:
-        printed = PrintedProbes(dprnt, submitting(dprnt.name), applied, report)
-        runs.append(Stream(dprnt, printed, report).run(stop))
+        printed = PrintedProbes(dprnt, submitting(dprnt.name), applied, log.info)
+        runs.append(Stream(dprnt, printed, log.info).run(stop))
     for linuxcnc in settings.linuxcnc:
-        file = ProbeFile(linuxcnc, submitting(Path(linuxcnc.file).name), applied, report)
+        file = ProbeFile(linuxcnc, submitting(Path(linuxcnc.file).name), applied, log.info)
         runs.append(file.run(stop))
     async with asyncio.TaskGroup() as group:
         for run in runs:

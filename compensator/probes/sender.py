@@ -30,7 +30,7 @@ class _Waiting(NamedTuple):
     done: Callable[[Outcome], None]
 
 
-class Sender:
+class ProbeQueue:
     """Sends what the sources submit.
 
     Parameters

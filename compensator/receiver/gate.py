@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
+from .count_restart import CountRestart, Numbered
 from .limits import Acceptance
 from .message import Rejected
 from .reasons import Reason, printable
-from .restart import CountRestart, Numbered
 
 
 class Measured(Numbered, Protocol):

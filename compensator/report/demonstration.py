@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from compensator.arrays import Vector
-from compensator.identify.comparison import Row as Comparison
+from compensator.identify.coefficients import Row as Comparison
 from compensator.identify.summary import comparison_table
 from compensator.report.page import Block, Cell, Details, Figure, Line, Link, Page, Section, Table
 from compensator.report.shop import ShopDay, shop_section

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.ceiling import ceiling, falls_short, remainder
+from compensator.diagnose.advice_words import advice_lines
+from compensator.diagnose.ceiling_words import ceiling, falls_short
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import off_zero
+from compensator.diagnose.free_run_words import off_zero
 from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.standing import is_contradicted, is_in_the_model
+from compensator.diagnose.remainder_words import remainder
+from compensator.diagnose.standing import is_in_the_model
 from compensator.diagnose.summary import (
     SHOWN,
     channels_to_configure,
@@ -25,10 +27,10 @@ from compensator.diagnose.summary import (
     parameter_table,
     rivals,
 )
+from compensator.diagnose.verdict import is_contradicted
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.advice import advice_blocks
 from compensator.report.figure import Edges
 from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import (
@@ -106,7 +108,7 @@ def page_of(
     blocks += channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         blocks.append(Words(title="What could hide", lines=hidden))
-    blocks += advice_blocks(diagnosis)
+    blocks += _advice(diagnosis)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
@@ -118,9 +120,9 @@ def page_of(
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     """Show the residual of the base model, the effects over it, and below it what the largest of them act by."""
     total = np.sum([effect.removed for effect in diagnosis.effects], axis=0)
-    rest, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
-    deployed = rest is not None and rest.deployed
-    stands = deployed and rest is not None and rest.instead
+    remainder, beside = diagnosis.remainder, diagnosis.paths_um + diagnosis.remainder_um
+    deployed = remainder is not None and remainder.deployed
+    stands = deployed and remainder is not None and remainder.instead
     causes = {cause[0]: cause for effect in diagnosis.effects for cause in _causes(diagnosis, effect)}
     below = _panels(time, list(causes.values())[:CAUSES], edges=time.unnamed_runs, height=1.7)
     one = len(diagnosis.effects) == 1
@@ -193,8 +195,8 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
     """Show the residual without the effect, the effect over it, and below it what it acts by."""
     causes = _causes(diagnosis, effect)
     below = _panels(time, causes, edges=time.unnamed, height=1.9)
-    rest = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
-    note = f"Residual in the data that were searched, without every other effect.{rest}"
+    with_remainder = " The remainder is not removed from it." if diagnosis.remainder_um.any() else ""
+    note = f"Residual in the data that were searched, without every other effect.{with_remainder}"
     return Figure(
         title=f"{name(effect)} in the residual",
         x_label=time.label,
@@ -244,6 +246,24 @@ def _causes(diagnosis: Diagnosis, effect: FoundEffect) -> list[tuple[str, str, V
     if path == "TDTF":
         return [("AT, change from the start", "K", source)]
     return [("heat, estimated", "W", source) if diagnosis.model.ttf else ("T_Q − AT", "K", source)]
+
+
+def _advice(diagnosis: Diagnosis) -> list[Block]:
+    """Return a section with the advice; none where there is nothing to do."""
+    lines, advice = advice_lines(diagnosis.advice), diagnosis.advice
+    if not lines or advice is None:
+        return []
+    blocks: list[Block] = [Words(title="Advice", lines=lines)]
+    if advice.unexplained is not None and advice.nearest:
+        rows = [[near.channel, f"{near.evidence:.1f}", f"{near.lag_min:+.0f}"] for near in advice.nearest]
+        blocks.append(
+            Table(
+                head=["nearest channel", "adds to the log evidence", "best single lag, min"],
+                rows=rows,
+                note="Each channel alone, with lags in both directions. Negative: the channel follows the cause.",
+            )
+        )
+    return [Section(title="What to measure and test next", blocks=blocks)]
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:

@@ -17,8 +17,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 
+from compensator.report.cursor import axes_id, can_be_read, line_id, plot_data
 from compensator.report.figure import Bar, Edges, Figure, Line, described, thinned
-from compensator.report.reading import axes_id, can_be_read, line_id, plot_data
 
 #: Placeholder colours of text and axes, of grid and spans, and of curves; the page's CSS variables replace them.
 INK, GRID = "#010101", "#020202"

@@ -12,7 +12,7 @@ from compensator.arrays import Vector
 from compensator.display import with_std
 from compensator.identify.calibration import Calibration, Part, joined
 from compensator.identify.choice import TriedStructure
-from compensator.identify.comparison import Row as Comparison
+from compensator.identify.coefficients import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
 from compensator.identify.summary import (
     comparison_table,

@@ -21,10 +21,10 @@ from compensator import __version__
 from compensator.atomic_write import atomic_write
 from compensator.codes import explain
 from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sentence_of, text_of, warnings_of
+from compensator.report.cursor import script, script_hash
 from compensator.report.drawing import WIDTH_IN, svg
 from compensator.report.figure import Bar, Figure, Line, Marks, Span, Stems, Strip
 from compensator.report.local_time import today
-from compensator.report.reading import script, script_hash
 
 Tone = Literal["good", "warn", "bad"]
 #: Width of a figure in a row of several, inches: the text stays readable.

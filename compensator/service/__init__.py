@@ -1,1 +1,1 @@
-"""The service: sampling, guards, compensation, limits, recording, publishing, the loop."""
+"""The service: sampling, guards, compensation, limits, recording, publishing, the search for better models."""

@@ -16,7 +16,7 @@ from compensator.events import DOUBT, CommandName, EventKind
 from compensator.messages import UNREADABLE, Probe
 from compensator.service.compensation import Compensation, doubt_of_rest
 from compensator.service.event_log import EventLog
-from compensator.service.loop.live import LiveLoop
+from compensator.service.loop.live import ServiceLoop
 from compensator.service.probing import ReceivedProbe, read_probe
 from compensator.service.probing.received import ProbeRefused, unused_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, longest, refusal
@@ -57,7 +57,7 @@ class Commands:
         Name of the machine.
     unproven : bool
         Whether unauthenticated senders are accepted.
-    loop : LiveLoop, optional
+    loop : ServiceLoop, optional
         Executes `dismiss`, and `adopt` of its candidate.
     """
 
@@ -70,7 +70,7 @@ class Commands:
         running: Callable[[], Compensation],
         machine: str,
         unproven: bool,
-        loop: LiveLoop | None = None,
+        loop: ServiceLoop | None = None,
     ) -> None:
         self._events = events
         self._adoption = adoption
@@ -78,7 +78,7 @@ class Commands:
         self._running = running
         self._machine = machine
         self._unproven = unproven
-        self._models = loop
+        self._loop = loop
         #: Probes for the next sample in the order of their arrival, those of them that passed the checks, records of
         #: what cannot be decided with it, and how many more were refused.
         self._probes: list[ReceivedProbe] = []
@@ -89,42 +89,42 @@ class Commands:
         self._refused = 0
         #: Whether an answer about the candidate of the loop waits for the next sample.
         self._is_answered = False
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._event_loop: asyncio.AbstractEventLoop | None = None
 
     def open(self) -> None:
-        """Accept commands from now on, in the running loop."""
-        self._loop = asyncio.get_running_loop()
+        """Accept commands from now on, in the running event loop."""
+        self._event_loop = asyncio.get_running_loop()
 
     def close(self) -> None:
         """Refuse commands from now on."""
-        self._loop = None
+        self._event_loop = None
 
     def receive(self, name: str, payload: bytes, sender: Sender) -> Reply:
         """Accept or refuse a command from another thread; see `Daemon.command`."""
-        loop = self._loop
+        event_loop = self._event_loop
         try:
             self._check_sender(name, payload, sender)
-            if loop is not None and name == CommandName.PROBE:
+            if event_loop is not None and name == CommandName.PROBE:
                 decided: Future[dict[str, Any]] = Future()
-                loop.call_soon_threadsafe(self._receive_probe, payload, sender, self._clock.utc_ns(), decided)
+                event_loop.call_soon_threadsafe(self._receive_probe, payload, sender, self._clock.utc_ns(), decided)
                 return decided
             arguments = self._checked(name, payload)
-            if loop is None or self._is_full(name):
+            if event_loop is None or self._is_full(name):
                 raise ServiceError("the service cannot accept a command now")
             if name in _ABOUT_MODELS:
                 request = ModelRequest.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
                 if name == CommandName.DISMISS or request.candidate:
-                    loop.call_soon_threadsafe(self._decide_candidate, name, request, sender, reply)
+                    event_loop.call_soon_threadsafe(self._decide_candidate, name, request, sender, reply)
                     return reply
-                loop.call_soon_threadsafe(self._begin_change, name, request, sender, reply)
+                event_loop.call_soon_threadsafe(self._begin_change, name, request, sender, reply)
                 return reply
         except ServiceError as error:
-            if loop is not None:
-                loop.call_soon_threadsafe(self._note_refusal, name, str(error), sender)
+            if event_loop is not None:
+                event_loop.call_soon_threadsafe(self._note_refusal, name, str(error), sender)
             return refusal(str(error))
         warm_um = self._running().warm_um if arguments.get("mode") == "rest" else None
-        loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
+        event_loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
         warning = f"{DOUBT}{doubt_of_rest(warm_um)}" if warm_um is not None else ""
         waits = _counts_on_state(name, arguments) and self._running().has_gap
         when = "once T_Q and AT have been there for a sample" if waits else "at the next sample"
@@ -157,25 +157,25 @@ class Commands:
 
     def _answer(self, compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
         """Pass a command on to the loop; the candidate that was meant may have given its place since the answer."""
-        if self._models is None:
+        if self._loop is None:
             return
         if name == CommandName.DISMISS:
-            self._models.dismiss(compensation, arguments["sha256"])
+            self._loop.dismiss(compensation, arguments["sha256"])
         elif name == CommandName.RESUME:
-            self._models.resume()
+            self._loop.resume()
         elif name == CommandName.ADOPT:
-            self._models.accept(arguments["sha256"])
+            self._loop.accept(arguments["sha256"])
 
     def _decide_candidate(
         self, name: str, request: ModelRequest, sender: Sender, reply: Future[dict[str, Any]]
     ) -> None:
-        """Answer a command about the candidate of the loop; it acts with the next sample. In the loop only."""
+        """Answer a command about the candidate of the loop; it acts with the next sample. In the event loop only."""
         try:
-            if self._models is None:
+            if self._loop is None:
                 raise ServiceError(
                     'the service looks for no better model; expected [loop] with policy = "propose" or "adopt"'
                 )
-            if self._loop is None:
+            if self._event_loop is None:
                 raise ServiceError("the service is ending")
             if 0 < len(request.sha256) < FEWEST_DIGITS:
                 raise ServiceError(f"sha256 = {request.sha256!r}, expected at least {FEWEST_DIGITS} digits of a hash")
@@ -188,7 +188,7 @@ class Commands:
             unproposed = "wait, or use --force"
             if name == CommandName.DISMISS:
                 unproposed = "" if request.sha256 else "name it: compensator dismiss HASH"
-            offer = self._models.offer(self._running(), request.sha256, unproposed="" if request.force else unproposed)
+            offer = self._loop.offer(self._running(), request.sha256, unproposed="" if request.force else unproposed)
         except ServiceError as error:
             self._note_refusal(name, f"{name}: {error}", sender)
             reply.set_result(refusal(f"{name}: {error}"))
@@ -203,7 +203,7 @@ class Commands:
         reply.set_result({"ok": True, "text": text} | figures)
 
     def _begin_change(self, name: str, request: ModelRequest, sender: Sender, reply: Future[dict[str, Any]]) -> None:
-        """Begin to change the model, unless an answer that is accepted would be lost by it. In the loop only."""
+        """Begin to change the model, unless an answer that is accepted would be lost by it. In the event loop only."""
         if not self._is_answered:
             self._adoption.begin(name, request, reply, sender)
             return
@@ -221,7 +221,7 @@ class Commands:
         return probes, unused
 
     def _receive_probe(self, payload: bytes, sender: Sender, now_ns: int, reply: Future[dict[str, Any]]) -> None:
-        """Check a probe at once; it is compared with the prediction at the next sample. In the loop only."""
+        """Check a probe at once; it is compared with the prediction at the next sample. In the event loop only."""
         try:
             text = self._admit_probe(payload, sender, now_ns)
             reply.set_result({"ok": True, "code": "", "text": text})
@@ -240,7 +240,7 @@ class Commands:
             raise
         received = ReceivedProbe(request=request, received_utc_ns=now_ns, **sender.data())
         try:
-            if self._loop is None:
+            if self._event_loop is None:
                 raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")
             probing.check(received, self._admitted)
         except ProbeRefused:

@@ -29,7 +29,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.disk_writer import DiskWriter, Entry, Recorder
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
-from compensator.service.loop.live import LiveLoop, LoopParts
+from compensator.service.loop.live import LoopParts, ServiceLoop
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.probing import ReceivedProbe
 from compensator.service.probing.received import undecided_probe
@@ -41,7 +41,8 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: How long the loop waits for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
+#: How long the sampling loop waits for the disk: a fraction of the poll interval, so that no poll is late, and a limit
+#: in s.
 DISK_PART, DISK_S = 0.4, 2.0
 #: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
 #: and a limit in s. An offset of that age is usable because its rate is published with it.
@@ -73,7 +74,7 @@ class Daemon:
     publish : callable
         Publishes a message by name and JSON; never waits.
     clock : Clock
-        Clock of the loop.
+        Clock of the sampling loop.
     first_sequence : int
         Sequence number of the first sample.
     recordings : pathlib.Path
@@ -119,9 +120,9 @@ class Daemon:
             checkpoint=checkpoint,
         )
         self._sampler = Sampler(config, devices, clock, self._events.note)
-        self._loop: LiveLoop | None = None
+        self._loop: ServiceLoop | None = None
         if loop is not None:
-            self._loop = LiveLoop(
+            self._loop = ServiceLoop(
                 config,
                 loop,
                 recordings,
@@ -534,6 +535,6 @@ class Daemon:
         -------
         dict or Future of dict
             `ok` and `text`; a future of them for `adopt` and `back`, whose warm-up takes time, and for `probe`, which
-            the loop checks at once (with `code`).
+            the event loop checks at once (with `code`).
         """
         return self._commands.receive(name, payload, sender)

@@ -154,7 +154,7 @@ class DiskWriter:
         self._attempt: Future[None] | None = None
         self._dropped = 0
 
-    # ------------------------------------------------------------------ on the loop
+    # ------------------------------------------------------------------ on the event loop
 
     @property
     def file(self) -> str:

@@ -41,7 +41,7 @@ class Journal:
     clock : Clock
         For waiting.
     limit_s : float
-        How long the loop waits for the disk, s.
+        How long the sampling loop waits for the disk, s.
     patience_s : float
         How long an offset waits for the disk while polling continues, s; it does not wait if the previous one was late.
     checkpoint : OffsetCheckpoint, optional

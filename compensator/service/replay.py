@@ -2,8 +2,8 @@
 
 The audit, the comparison with another model, the restart and the warm-up of another model read and run recordings here.
 `apply` repeats what the service did with one group of records. This suffices if the state comes from the file: each
-file starts with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
-whose state is in no file: it also accounts for the pauses.
+file starts with the state before its first sample, after any pause. `ForeignRun` is for a compensation of another
+model, whose state is in no file: it also accounts for the pauses.
 
 A pause is a number of samples that the compensation did not receive. It cannot be derived from times, as the wall clock
 may be set. A pause is therefore
@@ -292,7 +292,7 @@ def apply(
 # ---------------------------------------------------------------------- another model
 
 
-class FreeRun:
+class ForeignRun:
     """Runs one file after the other through a compensation whose state they do not contain.
 
     Parameters

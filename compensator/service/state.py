@@ -138,11 +138,6 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     axes: dict[str, OutputState] | None = None
 
 
-def encode_state(state: CompensationState) -> bytes:
-    """Return a state as JSON."""
-    return frozen_state(state)()
-
-
 def frozen_state(state: CompensationState) -> Callable[[], bytes]:
     """Copy a state; return what encodes the copy as JSON, which few samples need: those that open a file."""
     table = msgspec.to_builtins(state)

@@ -33,7 +33,7 @@ def worst(offset: Offset, axes: Mapping[str, AxisOffset], before: int) -> tuple[
     return state, list(dict.fromkeys(reason for one in (offset, *valid) for reason in one.reasons))
 
 
-def missing_axes(offset: Offset | None, axes: Mapping[str, AxisOffset], due: int | None = None) -> list[str]:
+def missing_axes(offset: Offset | None, axes: Mapping[str, AxisOffset], due: int | None) -> list[str]:
     """Return the labels of the axes of a machine that have no offset of its newest sample; none if it has Y alone.
 
     Parameters
@@ -42,7 +42,7 @@ def missing_axes(offset: Offset | None, axes: Mapping[str, AxisOffset], due: int
         Of Y.
     axes : mapping of str to AxisOffset
         Those of further axes that were received last.
-    due : int, optional
+    due : int or None
         Number of an earlier sample that is asked for instead of the newest.
     """
     if not isinstance(offset, AxisOffset):

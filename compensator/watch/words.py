@@ -135,7 +135,7 @@ def probe_text(probe: dict[str, Any]) -> str:
     return f"No probe wanted ({figures}). {PROBE_FOR}"
 
 
-def loop_commands(sha256: str, config: str = CONFIG) -> tuple[str, str]:
+def loop_commands(sha256: str, config: str) -> tuple[str, str]:
     """Return what a person can answer to a candidate: yes and no, about this one and no other.
 
     Examples

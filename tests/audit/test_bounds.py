@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from compensator.audit.comparison import compare
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
+from compensator.audit.other_model import compare
 from compensator.data.export import export
 from compensator.data.files import read_recordings
 from compensator.errors import DataError

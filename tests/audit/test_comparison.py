@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import COLUMNS, compare
+from compensator.audit.other_model import COLUMNS, compare
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.errors import DataError
@@ -65,31 +65,31 @@ def test_the_figures_are_those_of_a_plain_loop(tmp_path: Path) -> None:
     would = np.array([number(o.offset.y_offset_um) for o in outcomes])
     y = np.array([number(e.y_um) for e in estimates])
     measured = ~np.isnan(y)
-    assert measured.sum() == 105 == found.residual_before.samples == found.residual_after.samples
-    assert found.samples == 120 == found.offsets.samples
+    assert measured.sum() == 105 == found.own.residual_before.samples == found.own.residual_after.samples
+    assert found.samples == 120 == found.own.offsets.samples
     for spread, values in (
-        (found.residual_before, before[measured]),
-        (found.residual_after, after[measured]),
-        (found.offsets, would - was),
-        (found.left_before, (y + was)[measured]),
-        (found.left_after, (y + would)[measured]),
+        (found.own.residual_before, before[measured]),
+        (found.own.residual_after, after[measured]),
+        (found.own.offsets, would - was),
+        (found.own.left_before, (y + was)[measured]),
+        (found.own.left_after, (y + would)[measured]),
     ):
         assert spread.rms == pytest.approx(math.sqrt(np.mean(values**2)), rel=1e-12)
         assert spread.peak == values[np.argmax(np.abs(values))]
-    assert round(found.offsets.at_s * NS) == offsets[int(np.argmax(np.abs(would - was)))].time_utc_ns
-    assert found.offsets.rms > 0.2
+    assert round(found.own.offsets.at_s * NS) == offsets[int(np.argmax(np.abs(would - was)))].time_utc_ns
+    assert found.own.offsets.rms > 0.2
     assert [row[1] for row in rows] == list(range(120)) and len(rows[0]) == len(COLUMNS)
     assert [row[6] for row in rows] == [repr(float(value)) for value in would]
     assert rows[60][2] == "" and rows[60][4] == ""  # what is missing is empty
     text = found.text()
     assert text.startswith("120 samples; 105 of them have a residual with both models\n")
-    assert f"{found.residual_after.rms:.3f}" in text and "other" in text and "quill (recorded)" in text
+    assert f"{found.own.residual_after.rms:.3f}" in text and "other" in text and "quill (recorded)" in text
 
 
 def test_the_recorded_model_itself_makes_no_difference(tmp_path: Path) -> None:
     Service(tmp_path, start_ns=EVENING_NS).run(100).stop()
     found = compare(recordings(tmp_path, MACHINE), parse_model(QUILL, source="test"))
-    assert found.offsets.peak == 0.0 and found.residual_before == found.residual_after and not found.remarks
+    assert found.own.offsets.peak == 0.0 and found.own.residual_before == found.own.residual_after and not found.remarks
 
 
 def test_a_recording_that_begins_on_a_running_machine_is_remarked(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_time_without_samples_is_a_pause(tmp_path: Path) -> None:
         if i == 30:
             compensation.pause(10)
         last = compensation.process(sample)
-    first_peak = abs(found.residual_after.peak)
+    first_peak = abs(found.own.residual_after.peak)
     assert found.samples == 60 and math.isfinite(first_peak)
     rows: list[list[object]] = []
     compare(recordings(tmp_path, MACHINE), OTHER, row=lambda row: rows.append(list(row)))

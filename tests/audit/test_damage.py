@@ -13,7 +13,7 @@ import pytest
 import zstandard
 from mcap.writer import Writer
 
-from compensator.audit.series import Audit, audit, summary
+from compensator.audit.machine_audit import Audit, audit, summary
 from compensator.cli import main
 from compensator.recording.container import MAGIC
 from compensator.recording.framing import (

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from compensator.audit.series import Audit, audit
+from compensator.audit.machine_audit import Audit, audit
 from compensator.errors import CompensatorError, DataError
 from compensator.recording.container import MAGIC, Container
 from compensator.recording.finishing import compact

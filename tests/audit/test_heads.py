@@ -13,8 +13,8 @@ import msgspec
 import pytest
 from mcap.writer import Writer
 
+from compensator.audit.machine_audit import Audit, audit, combine, summary
 from compensator.audit.result import RecordingAudit
-from compensator.audit.series import Audit, audit, combine, summary
 from compensator.clock import NS
 from compensator.codes import RecordingEnd
 from compensator.config import load_config

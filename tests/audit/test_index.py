@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.cli import main
 from compensator.recording.container import Container
 from compensator.recording.framing import (

@@ -13,7 +13,7 @@ from typing import BinaryIO
 import pytest
 import zstandard
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.messages import encode
 from compensator.recording import container, live_file
 from compensator.recording.container import LARGEST, LONGEST, MAGIC

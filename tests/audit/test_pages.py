@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import AxisComparison, Comparison
 from compensator.audit.findings import KEPT
+from compensator.audit.other_model import AxisComparison, OtherModel
 from compensator.audit.pages import Curves, comparison_page
 from compensator.cli import main
 from compensator.recording.container import MAGIC
@@ -167,7 +167,7 @@ def test_the_tone_says_which_is_better(after: float, tone: str) -> None:
     if not math.isnan(after):
         before.add(2.0, 1)
         then.add(after, 1)
-    found = Comparison("a", "b", AxisComparison(before, then, before, then, Spread()), 1, [])
+    found = OtherModel("a", "b", AxisComparison(before, then, before, then, Spread()), 1, [])
     curves = Curves()
     curves.add(60 * 10**9, math.nan, 1.0, math.nan, 2.0)
     made = comparison_page(found, curves)

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.audit.series import Audit, audit, summary
+from compensator.audit.machine_audit import Audit, audit, summary
 from compensator.commands.workers import workers
 from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
 from compensator.messages import Seal, encode

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from compensator.audit.findings import Finding
+from compensator.audit.machine_audit import Audit, audit, summary
 from compensator.audit.pages import audit_page
-from compensator.audit.series import Audit, audit, summary
 from compensator.audit.verdict import verdict
 from compensator.recording.container import Attachment, Contents
 from compensator.recording.reading import in_order, recordings

@@ -20,7 +20,7 @@ from unittest import mock
 import msgspec
 from mcap.reader import make_reader
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.commands.workers import workers
 from compensator.messages import MESSAGES
 from compensator.recording.container import PAYLOAD, Container

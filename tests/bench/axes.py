@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.messages import encode
 from compensator.recording.reading import messages
 from compensator.service.compensation import Compensation, model_of

@@ -42,12 +42,12 @@ from pathlib import Path
 import numpy as np
 
 import compensator as tc
-from compensator.api.loop import diagnosis_in_process
+from compensator.api.loop_diagnosis import diagnosis_in_process
 from compensator.demo.offline import probe_of, run_alone
 from compensator.errors import CompensatorError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
-from compensator.service.loop.run import Diagnosed, LoopRun
+from compensator.service.loop.run import Diagnosed, OfflineLoop
 from compensator.service.loop.weighing import failed
 from sim_hardware.drawn_machines.weeks import DEVELOPMENT_WEEKS, SEALED_WEEK_RUNS, SEALED_WEEKS
 from tests.bench.cases import judge
@@ -84,7 +84,7 @@ class Diagnoses:
             began = time.perf_counter()
             try:
                 self.found[key] = self._diagnose(outcomes, model)
-            except CompensatorError as error:  # as LoopRun has it
+            except CompensatorError as error:  # as OfflineLoop has it
                 self.found[key] = failed(str(error))
             self.seconds += time.perf_counter() - began
         return self.found[key]
@@ -94,13 +94,14 @@ class Service:
     """A machine's service and loop that is killed and continues from its last state."""
 
     def __init__(self, config, model, diagnoses):
-        self._made = lambda: LoopRun(config, model, diagnoses)
+        self._made = lambda: OfflineLoop(config, model, diagnoses)
         self.run = self._made()
         self.steps = []
         self._kept, self._state = 0, self.run.state()
 
     def process(self, sample, probe, is_visit):
-        if len(self.steps) - self._kept >= STATE_EVERY and not self.run.has_result:
+        # No state has the result of a diagnosis that counts from the next sample on.
+        if len(self.steps) - self._kept >= STATE_EVERY and self.run._found is None:
             self._kept, self._state = len(self.steps), self.run.state()
         step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
         self.steps.append((sample, probe, step, is_visit))
@@ -179,7 +180,7 @@ def _figures(week):
     diagnoses = Diagnoses(diagnosis_in_process(config), kill_at=(2,))
     service, restarts = looped(config, file, samples, diagnoses)
     steps = [step for _, _, step, _ in service.steps]
-    again, last, same = LoopRun(config, file, _recorded(diagnoses)), None, True
+    again, last, same = OfflineLoop(config, file, _recorded(diagnoses)), None, True
     for sample, probe, step, is_visit in service.steps:
         same = same and seen(advance(again, last, sample, probe, is_visit)) == seen(step)
         last = sample.seq

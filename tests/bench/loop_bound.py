@@ -15,7 +15,7 @@ from compensator.demo.offline import run_alone
 from compensator.events import ComparisonVerdict
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.state import Place
+from compensator.service.loop.state import InShadow
 from compensator.service.loop.trust import all_suspect_a_sensor, is_contradicted
 from tests.bench.loop_week import PERIOD_S, error_of, samples_of
 
@@ -59,7 +59,7 @@ class Bound:
 
 def shown_at(acted, healthy, spell, config):
     """Return the first minute in which a spell is shown; None if it is not while it acts."""
-    place = Place(sha256="", effects=[], role="candidate", since_utc_ns=0)
+    place = InShadow(sha256="", effects=[], role="candidate", since_utc_ns=0)
     compared = Compared(place, config.loop, PERIOD_S, ErrorBlocks())
     for present, other in zip(acted, healthy, strict=True):
         minute = present.sample.seq

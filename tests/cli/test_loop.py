@@ -15,7 +15,7 @@ from compensator.cli import main
 from compensator.clock import NS
 from compensator.demo.machine import configuration
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.run import Diagnosed
 from tests.audit.made import CONFIG, QUILL, Service, readings
 
@@ -182,8 +182,8 @@ def test_samples_during_a_hold_by_hand_are_not_diagnosed(
 def test_a_resume_of_the_recordings_is_one_of_the_models_in_shadow_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resumed: list[ModelLoop] = []
-    monkeypatch.setattr(ModelLoop, "resume", lambda core: resumed.append(core))
+    resumed: list[ShadowedLoop] = []
+    monkeypatch.setattr(ShadowedLoop, "resume", lambda core: resumed.append(core))
     result([str(recorded(tmp_path / "held", 120, hold=30, resume=60))], capsys)
     assert len(resumed) == 1
 

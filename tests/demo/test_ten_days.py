@@ -13,7 +13,7 @@ from compensator.events import EventKind, LoopAction, LoopData
 from compensator.messages import SCHEMA, Event, Offset
 from compensator.report.page import html_of
 from compensator.report.ten_days import DAYS, MachineDays, days_page, days_table, days_verdict
-from compensator.service.loop.run import Diagnosed, LoopRun
+from compensator.service.loop.run import Diagnosed, OfflineLoop
 from sim_hardware.physics import QuillMachine, World, usual_sensors
 
 HOUR_NS = 3_600_000_000_000
@@ -127,7 +127,7 @@ def test_a_machine_runs_with_its_sensor_or_its_probes(short, is_probed):
 
     from compensator.model.model_file import read_model_bytes
 
-    outcomes, events = demo._looped(LoopRun(config, read_model_bytes("quill"), diagnose), samples)
+    outcomes, events = demo._looped(OfflineLoop(config, read_model_bytes("quill"), diagnose), samples)
     assert len(outcomes) == 1440
     # 20 h after the start at 06:00 it is 02:00; with probes also 12 h before. And after the effects have shown for 3 h.
     assert asked == ([480, 1200, 1320] if is_probed else [859, 1039, 1200])

@@ -9,7 +9,6 @@ import pytest
 from compensator.diagnose.advice import Unexplained, _sensor, advice_of, resembling
 from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.events import follows_day, goes_with, steepest, swings, switched
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
@@ -18,8 +17,8 @@ from compensator.diagnose.nearest import Near, nearest
 from compensator.diagnose.points import Points
 from compensator.diagnose.record_with_test import HOURS as HOURS_OF_TESTS
 from compensator.diagnose.record_with_test import expected_change
-from compensator.diagnose.series import series_of
 from compensator.diagnose.summary import contents, figures
+from compensator.diagnose.switched import follows_day, goes_with, steepest, swings, switched
 from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
 from compensator.diagnose.warning_words import warnings_on
 from compensator.display import Words
@@ -81,7 +80,7 @@ def test_the_advice_is_in_the_file_on_the_terminal_and_on_the_page(door):
     found = door[1]
     table = json.loads(json.dumps(figures(found)))["advice"]
     assert table["unexplained"]["goes_with"]["event"] == "coolant_flow_lpm"
-    assert {when["run"] for when in table["unexplained"]["when"]} == set(series_of(found)["run"]), "as in series.csv"
+    assert {when["run"] for when in table["unexplained"]["when"]} == set(found.series()["run"]), "as in series.csv"
     assert table["tests"][0]["decides"] is True and table["sensor"]
     said = [
         part for part in contents(found, ()) if isinstance(part, Words) and part.title.startswith("What to measure")

@@ -69,6 +69,19 @@ def test_json_model_and_page(first, base):
         assert words in page
 
 
+def test_the_model_states_the_verdict_that_a_run_that_took_no_part_leaves(tmp_path):
+    """What was found acts in the data that were searched, and not in the other run."""
+    searched, other = (
+        {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns}
+        for columns, _, _ in (record([draw("input", 4)], 79, 10.0), record([], 80, 10.0))
+    )
+    found = tc.diagnose("quill", searched, validate=other)
+    assert (found.diagnosis.verdict, found.verdict) == ("explained", "partly_explained")
+    found.save(tmp_path)
+    said = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))["verdict"]
+    assert said == load_model(tmp_path / "model.toml").provenance["diagnosis"]["verdict"] == "partly_explained"
+
+
 def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, first, capsys):
     out = first[0]
     # The drift is of the measurement: what the service states is the error on the machine.

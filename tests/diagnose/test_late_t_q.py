@@ -18,7 +18,6 @@ from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
-from compensator.diagnose.series import series_of
 from compensator.identify.calibration import predict
 from compensator.model.effects.base import Effect, effect_from, filters
 from compensator.model.effects.delay import DelayedSensor
@@ -202,7 +201,7 @@ def test_a_correction_that_does_harm_is_left_out_and_what_stands_beside_it_is_de
     assert found.after.rms_um == pytest.approx(gain.rms_after_um, rel=0.1)
     assert removed(found, [late], [weaker]) > 0.85
     # The page draws what the model takes off, and what is left with the delay in it.
-    curves = series_of(found)
+    curves = found.series()
     assert np.nanstd(curves["residual_after_um"]) == pytest.approx(gain.rms_after_um, rel=0.05)
     assert curves["effect_1_um"].any() and not curves["effect_2_um"].any()
     assert len(found.steps) == 1

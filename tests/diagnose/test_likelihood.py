@@ -8,7 +8,7 @@ from compensator.diagnose.background import Background, _Problem
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.scan import Scan
 from compensator.diagnose.search import Search
 from compensator.diagnose.whitening import MANY, Whitening
@@ -18,7 +18,7 @@ from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
-REST = Rest(0.2, 1.5, 90.0, 3.0, 0.4, 0.5)
+REST = SlowRest(0.2, 1.5, 90.0, 3.0, 0.4, 0.5)
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,14 @@ import compensator as tc
 from compensator.diagnose import diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.detection_limit import detection_limits
-from compensator.diagnose.events import HEAT
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.record_with_test import HOURS, RecordWithTest
 from compensator.diagnose.search import Search
+from compensator.diagnose.switched import HEAT
 from compensator.diagnose.trials import Trials
 from compensator.diagnose.whitening import Whitening
 from compensator.errors import DataError
@@ -250,7 +250,7 @@ def test_a_value_is_a_point_and_the_rest_decays_by_the_time_between():
     columns["y_um"] = np.where(np.isin(np.arange(2880), keep), columns["y_um"], np.nan)
     points = Points(evidence_of(QUILL, runs(columns)))
     assert points.count == keep.size
-    rest = Rest(1.5, 2.0, 150.0, 0.0, 0.0, 0.0)
+    rest = SlowRest(1.5, 2.0, 150.0, 0.0, 0.0, 0.0)
     apart = np.abs(keep[:, None] - keep[None, :])
     covariance = 1.5**2 * np.eye(keep.size) + 2.0**2 * np.exp(-apart / 150.0)
     y = points.residual

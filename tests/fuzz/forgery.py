@@ -19,7 +19,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-from compensator.audit.series import Audit, audit
+from compensator.audit.machine_audit import Audit, audit
 from compensator.errors import DataError
 from compensator.recording.container import LARGEST, MAGIC
 from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, HEADER, MESSAGE_INDEX, METADATA, SCHEMA

@@ -8,7 +8,7 @@ import pytest
 import compensator as tc
 from compensator.errors import DataError
 from compensator.identify.calibration import calibrate, predict
-from compensator.identify.comparison import compare
+from compensator.identify.coefficients import compare
 from compensator.identify.criticism import criticise
 from compensator.identify.output_error import Segment, Structure
 from compensator.identify.rest import settle_starts

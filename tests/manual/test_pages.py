@@ -29,7 +29,7 @@ QUOTED = re.compile(r"`(\w+)\.(\w+)` = (-?[\d.]+(?:e-?\d+)?)")
 #: A row of the table of settings: `module.NAME` or `Class.name`, and its value or values.
 SETTING = re.compile(r"^\| `(\w+\.\w+)` \| (-?[\d.e-]+(?:, -?[\d.e-]+)*) \|", flags=re.MULTILINE)
 #: Settings that are only shown; the page names them without a value.
-SHOWN = {"summary.SHOWN", "advice_words.SAID", "ceiling._NAMED"}
+SHOWN = {"summary.SHOWN", "advice_words.SAID", "remainder_words._NAMED"}
 #: Numbers of the loop that decide nothing.
 NO_SETTINGS = {"state.STATE_SCHEMA", "process._KILLED_S", "process._TAIL", "process._CITED"}
 

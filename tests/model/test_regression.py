@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.cli import main
 from compensator.demo.calibration import write_table
-from compensator.diagnose.ceiling import ceiling, remainder
+from compensator.diagnose.ceiling_words import ceiling
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
+from compensator.diagnose.remainder_words import remainder
 from compensator.diagnose.summary import figures, verdict
 from compensator.errors import ModelError, ServiceError
 from compensator.messages import Offset, number

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from compensator.probes.probe import Probe, Reply
-from compensator.probes.sender import WAITING, Outcome, Sender
+from compensator.probes.sender import WAITING, Outcome, ProbeQueue
 from tests.probes.helpers import Sink, until
 
 S = 1_000_000_000
@@ -21,7 +21,7 @@ class Bench:
         self.now_s = 1000
         self.reports: list[str] = []
         self.outcomes: list[tuple[int, Outcome]] = []
-        self.sender = Sender(
+        self.sender = ProbeQueue(
             self.sink, send_within_s=60.0, retry_s=0.01, report=self.reports.append, utc_ns=lambda: self.now_s * S
         )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from compensator.cli import main
-from compensator.identify.comparison import Row
+from compensator.identify.coefficients import Row
 from compensator.recording.reading import recordings
 from compensator.report.demonstration import MachineDay, page_of
 from compensator.report.page import Table, write_page

@@ -14,7 +14,7 @@ import pytest
 
 from compensator.cli import main
 from compensator.codes import WORDS
-from compensator.report.reading import script
+from compensator.report.cursor import script
 from tests.report.gallery import NAMES
 
 STYLE = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
@@ -106,7 +106,7 @@ def test_identifiers_are_unique_and_every_link_leads_somewhere(tree: Tree) -> No
 
 def test_nothing_is_loaded_and_no_other_script_runs(tree: Tree) -> None:
     assert not tree.all("link", "img", "iframe", "object", "embed", "video", "audio")
-    # Only the script of the plots, which test_reading.py follows.
+    # Only the script of the plots, which test_cursor.py follows.
     assert ["".join(e.text) for e in tree.all("script")] in ([], [script()])
     assert not any(
         key in ("src", "srcset", "action") or key.startswith("on") for e in tree.elements for key in e.attributes

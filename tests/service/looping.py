@@ -18,7 +18,7 @@ from compensator.model.effects import Effect, effect_from
 from compensator.model.effects.names import effect_names
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
-from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
+from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop
 from compensator.service.outcome import Outcome
 from tests.service.records import QUILL, sample
 from tests.service.simulated import config
@@ -130,7 +130,7 @@ class Night:
         return found
 
 
-def run(loop: LoopRun, samples: Iterator[Sample], count: int = 10**9) -> list[LoopStep]:
+def run(loop: OfflineLoop, samples: Iterator[Sample], count: int = 10**9) -> list[LoopStep]:
     """Run some samples through a loop."""
     return [loop.process(one) for _, one in zip(range(count), samples, strict=False)]
 

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import compare
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
+from compensator.audit.other_model import compare
 from compensator.cli import main
 from compensator.config import LoadedConfig, parse_config
 from compensator.errors import CompensatorError, ConfigError, ModelError, ServiceError
@@ -487,7 +487,7 @@ def test_shipped_schemas_of_several_axes_are_those_of_the_classes() -> None:
 def test_another_model_is_compared_on_y(day: SeveralAxes) -> None:
     found = compare(day.recordings[:1], load_model("quill"))
     assert found.samples == 300
-    assert found.residual_after.rms == pytest.approx(found.residual_before.rms, abs=1e-6)
+    assert found.own.residual_after.rms == pytest.approx(found.own.residual_before.rms, abs=1e-6)
 
 
 def test_another_model_is_compared_on_every_axis_that_is_measured(

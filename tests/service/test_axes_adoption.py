@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData
 from compensator.messages_axes import AxesEstimate

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.cli import main
 from compensator.clock import VirtualClock
 from compensator.config import Zenoh

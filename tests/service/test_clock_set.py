@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.clock import NS, VirtualClock
 from compensator.config import Zenoh, parse_config
 from compensator.messages import number

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.messages import Offset
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import recordings

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.errors import DataError
 from compensator.recording import compaction, finishing
 from compensator.recording.container import Contents

@@ -9,7 +9,7 @@ import pytest
 
 from compensator.errors import DataError
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.state import decode_state, encode_state
+from compensator.service.state import decode_state, frozen_state
 from tests.service.jumping import (
     BEGIN,
     END,
@@ -169,4 +169,4 @@ def test_a_state_of_an_exchange_of_one_channel_is_refused(day: dict[str, np.ndar
     assert state.jumps is not None
     state.jumps.exchanged = "yes"
     with pytest.raises(DataError, match="one channel"):
-        Compensation(settings(), QUILL).restore(encode_state(state))
+        Compensation(settings(), QUILL).restore(frozen_state(state)())

@@ -15,7 +15,7 @@ from compensator.model.thermal_model import Path, ThermalModel
 from compensator.model.transfer_function import TransferFunction
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.trust import was_wrong
-from compensator.service.state import decode_state, encode_state
+from compensator.service.state import decode_state, frozen_state
 from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
 from tests.service.records import QUILL, direct, sample
 
@@ -172,7 +172,7 @@ def test_a_hindsight_of_no_temperature_is_refused(day: dict[str, np.ndarray], ju
     assert state.jumps is not None and state.jumps.hindsight is not None
     state.jumps.hindsight.jumps_k = jumps_k
     with pytest.raises(DataError, match="hindsight"):
-        Compensation(settings({"false_alarm_days": 30.0}), QUILL).restore(encode_state(state))
+        Compensation(settings({"false_alarm_days": 30.0}), QUILL).restore(frozen_state(state)())
 
 
 @pytest.mark.parametrize(("begin", "end"), [(300, 360), (400, 450)])

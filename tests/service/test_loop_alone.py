@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from compensator.clock import HOUR_NS, NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import DiagnosisData
 from compensator.service.loop.avoided import avoid, is_avoided
-from compensator.service.loop.loop import Loop
-from compensator.service.loop.state import Place, Role, decode_loop
+from compensator.service.loop.decisions import LoopDecisions
+from compensator.service.loop.state import InShadow, Role, decode_loop
 from compensator.service.loop.words import ended
 from compensator.service.outcome import Outcome
-from compensator.service.transfer.comparison import BLOCK_NS
 from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.two_models import BLOCK_NS
 
 #: A planned diagnosis is 8 h later.
 BEGIN_NS = 1_767_592_800 * NS
@@ -40,8 +40,8 @@ def outcome(minute: int, residual_um: float, y_um: float, reasons: Sequence[str]
     return cast(Outcome, SimpleNamespace(sample=sample, estimate=estimate, offset=offset, notes=[], probes=shown))
 
 
-def place(name: str, role: Role = "candidate") -> Place:
-    return Place(sha256=name * 64, effects=[f"input:{name}"], role=role, since_utc_ns=BEGIN_NS)
+def place(name: str, role: Role = "candidate") -> InShadow:
+    return InShadow(sha256=name * 64, effects=[f"input:{name}"], role=role, since_utc_ns=BEGIN_NS)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Decided:
 
 
 def decided(
-    loop: Loop,
+    loop: LoopDecisions,
     hours: float,
     present: Reasons,
     others: dict[str, Reasons],
@@ -83,8 +83,8 @@ def decided(
             return
 
 
-def loop_of(*found: Place, watched: Place | None = None, **settings: Any) -> Loop:
-    loop = Loop(LoopSettings(**{"policy": "adopt", "every_h": 12} | settings), 60.0, ["gain:DTF"])
+def loop_of(*found: InShadow, watched: InShadow | None = None, **settings: Any) -> LoopDecisions:
+    loop = LoopDecisions(LoopSettings(**{"policy": "adopt", "every_h": 12} | settings), 60.0, ["gain:DTF"])
     loop.state.found, loop.state.watched = list(found), watched
     return loop
 
@@ -134,7 +134,7 @@ def test_the_zero_speaks_against_a_way_back_that_only_changes_show(level_um: flo
     assert [one.step for one in notes if one.step != "diagnose"] == steps
 
 
-def waited(loop: Loop, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:
+def waited(loop: LoopDecisions, hours: range, reasons: Reasons) -> list[tuple[float, str, str]]:
     """Run a loop whose models have the same alarms; return what it says of waiting: when, step and text."""
     said, noise = [], np.random.default_rng(1)
     for minute in range(60 * hours.start + 1, 60 * hours.stop + 1):
@@ -236,7 +236,7 @@ def test_a_candidate_that_leaves_a_limit_begins_to_count_anew() -> None:
 
 
 def diagnosed(
-    loop: Loop, *innovations_um: float, every: int = 40, ahead: Callable[[int], int] = lambda _: 0
+    loop: LoopDecisions, *innovations_um: float, every: int = 40, ahead: Callable[[int], int] = lambda _: 0
 ) -> list[tuple[float, str]]:
     """Run a day with probes alone, or without, by a clock that may be ahead, min; return the diagnoses that begin."""
     begun = []
@@ -284,7 +284,7 @@ def test_probes_before_a_change_of_the_model_say_nothing_about_the_new_one() -> 
 @pytest.mark.parametrize("effects", [[], ["gain:DTF"]])
 def test_a_way_back_from_a_model_without_effects_keeps_no_effect_from_being_left_out(effects: list[str]) -> None:
     """To be without an effect is what is diagnosed when the last one has ended: nobody has refused that."""
-    loop = Loop(LoopSettings(), 60.0, effects)
+    loop = LoopDecisions(LoopSettings(), 60.0, effects)
     loop.model_changed(["input:coolant_degc"], 10 * HOUR_NS, calibrated=[], back=True)
     assert [one.effects for one in loop.state.avoided] == ([effects] if effects else [])
 

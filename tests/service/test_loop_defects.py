@@ -12,8 +12,8 @@ import pytest
 from compensator.service.disk_writer import Entry
 from compensator.service.journal import Journal
 from compensator.service.loop import found, live
-from compensator.service.loop.core import ModelLoop
-from compensator.service.loop.loop import Loop
+from compensator.service.loop.core import ShadowedLoop
+from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from compensator.service.transfer.shadow import Shadow
 from tests.service.living import MACHINE
@@ -62,7 +62,13 @@ def said(machine: Looping) -> str:
 
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(Loop, "receive"), (Loop, "begin"), (ModelLoop, "begin_shadow"), (found, "warm_up"), (Loop, "shadow_begins")],
+    [
+        (LoopDecisions, "receive"),
+        (LoopDecisions, "begin"),
+        (ShadowedLoop, "begin_shadow"),
+        (found, "warm_up"),
+        (LoopDecisions, "shadow_begins"),
+    ],
 )
 async def test_between_two_samples_and_in_a_warm_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str
@@ -79,7 +85,7 @@ async def test_between_two_samples_and_in_a_warm_up(
 
 async def test_at_an_exchange_whose_model_is_stored_already(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
-    broken = Breaks(monkeypatch, Loop, "exchanged")
+    broken = Breaks(monkeypatch, LoopDecisions, "exchanged")
     await machine.run(960, until=lambda _: bool(broken.calls))
     await machine.run(60)
     assert machine.steps()[-2] == ("adopt", "") and "a defect" in said(machine)
@@ -104,7 +110,7 @@ async def test_what_runs_in_shadow_goes_on_when_a_newcomer_breaks(
 async def test_at_an_operators_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
     machine.at_sample[EVENING + 60] = Asked(machine, "dismiss", force=True)
-    broken = Breaks(monkeypatch, Loop, "dismiss")
+    broken = Breaks(monkeypatch, LoopDecisions, "dismiss")
     await machine.run(EVENING + 120)
     assert broken.calls and "a defect" in said(machine)
     unharmed(machine, EVENING + 120)
@@ -166,7 +172,7 @@ async def test_a_second_defect_turns_the_loop_off_and_says_so(tmp_path: Path, mo
 
     def breaks() -> None:
         Breaks(monkeypatch, Shadow, "process", always=True)
-        Breaks(monkeypatch, Loop, "give_up", always=True)
+        Breaks(monkeypatch, LoopDecisions, "give_up", always=True)
 
     machine.at_sample[EVENING + 60] = breaks
     await machine.run(EVENING + 120)
@@ -188,7 +194,7 @@ async def test_a_file_that_has_the_name_of_a_recording_only_takes_no_state(tmp_p
 async def test_at_the_start_of_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Looping(tmp_path, shown(extended()))
     await machine.run(EVENING + 60)
-    broken = Breaks(monkeypatch, ModelLoop, "process")
+    broken = Breaks(monkeypatch, ShadowedLoop, "process")
     await machine.run(60)
     assert broken.calls > 1
     assert any("without its state: internal error: ZeroDiv" in event.text for event in machine.events("restart"))

@@ -7,16 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-import compensator.api.loop as api
+import compensator.api.loop_diagnosis as api
 from compensator.api.diagnosis import DiagnosisResult
-from compensator.api.loop import Part, _diagnosed, diagnoses_of_table, diagnosis_of_record
+from compensator.api.loop_diagnosis import Part, _diagnosed, diagnoses_of_table, diagnosis_of_record
 from compensator.clock import NS
 from compensator.data.measurement import Measurement
 from compensator.data.table import Table
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import usable_table
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.outcome import Outcome
 from tests.service.looping import Night, machine, run, settings, shown
 from tests.service.test_restart import QUILL
@@ -29,14 +29,14 @@ SAMPLES, BEGINS, KNOCKED = 1440, 480, 800
 @pytest.fixture(scope="module")
 def begun() -> list[Outcome]:
     """What a service has on record of a machine on which an effect begins."""
-    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(None, "adequate")))
     return [step.outcome for step in run(loop, machine(SAMPLES, acts=lambda i: float(i > BEGINS)))]
 
 
 @pytest.fixture(scope="module")
 def knocked() -> Part:
     """Diagnosis of a machine whose mount was knocked."""
-    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(None, "adequate")))
     steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > KNOCKED)))
     return diagnoses_of_table(usable_table([step.outcome for step in steps]), QUILL)[0]
 

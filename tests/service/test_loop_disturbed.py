@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.config import Loop
+from compensator.config import LoopSettings
 from compensator.errors import CompensatorError, ServiceError
 from compensator.messages import Sample
 from compensator.service.compensation import Compensation
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
-from compensator.service.loop.core import LOOP_STATE, ModelLoop, shadow_files
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.core import LOOP_STATE, ShadowedLoop, shadow_files
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.schedule import begin_if_due, pass_planned
 from compensator.service.loop.state import LoopState
 from compensator.service.transfer.model_store import sha256_of
@@ -33,7 +33,7 @@ def moved(one: Sample, hours: float) -> Sample:
 
 @pytest.mark.parametrize("hours", [-3.0, 3.0])
 def test_a_clock_that_is_set_in_a_shadow_makes_no_decision_earlier(hours: float) -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     source = machine(FIRST + 2000)
     steps = run(loop, source, FIRST + 300)
     steps += run(loop, (moved(one, hours) for one in source))
@@ -44,7 +44,7 @@ def test_a_clock_that_is_set_in_a_shadow_makes_no_decision_earlier(hours: float)
 
 
 def test_a_weekend_is_no_time_in_which_a_candidate_was_compared() -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     source = machine(FIRST + 300 + 3600 + 1500)
     steps = run(loop, source, FIRST + 300)
     loop.pause(3600)
@@ -58,7 +58,7 @@ def test_a_weekend_is_no_time_in_which_a_candidate_was_compared() -> None:
 
 def test_a_clock_that_is_behind_by_a_month_ends_nothing_that_waits() -> None:
     """A flat battery: the service starts with a wrong time, which is set right some minutes later."""
-    loop = LoopRun(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
     source = machine(FIRST + 1500)
     run(loop, source, FIRST + 1200)
     now_ns = run(loop, source, 1)[0].outcome.sample.time_utc_ns
@@ -75,7 +75,7 @@ def test_a_clock_that_is_behind_by_a_month_ends_nothing_that_waits() -> None:
 
 def test_after_a_weekend_nothing_is_diagnosed_before_there_is_a_record() -> None:
     """The planned times that have passed meanwhile count as done, and so does what the model has erred by."""
-    loop = LoopRun(settings(loop={"misfit_h": 2.0}), QUILL, Night(shown(None, "adequate")))
+    loop = OfflineLoop(settings(loop={"misfit_h": 2.0}), QUILL, Night(shown(None, "adequate")))
     source = machine(FIRST + 120 + 3600 + 1000)
     run(loop, source, FIRST + 120)
     loop._core.state.misfit_min = 600.0
@@ -87,7 +87,7 @@ def test_after_a_weekend_nothing_is_diagnosed_before_there_is_a_record() -> None
 
 
 def test_a_person_who_agrees_twice_or_dismisses_then_gets_one_adoption() -> None:
-    loop = LoopRun(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
     source = machine(FIRST + 1500)
     steps = run(loop, source, FIRST + 1200)
     assert loop.phase == "proposed"
@@ -103,12 +103,12 @@ def test_a_person_who_agrees_twice_or_dismisses_then_gets_one_adoption() -> None
 
 
 def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     run(loop, machine(FIRST + 60))
     core = loop._core
     whole = core.attachments()
     present = Compensation(settings(), core.present)
-    assert ModelLoop(settings(), present.model, whole).shadows.keys() == {sha256_of(extended())}
+    assert ShadowedLoop(settings(), present.model, whole).shadows.keys() == {sha256_of(extended())}
     model, state = shadow_files(core.state)[sha256_of(extended())]
     for damaged in (
         {name: data for name, data in whole.items() if name != model},
@@ -119,7 +119,7 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
         whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":9', b'{"schema":8')},
     ):
         with pytest.raises(CompensatorError):
-            ModelLoop(settings(), present.model, damaged)
+            ShadowedLoop(settings(), present.model, damaged)
 
 
 def test_effects_that_were_gone_back_from_wait_a_day_and_then_twice_as_long() -> None:
@@ -135,7 +135,7 @@ def test_effects_that_were_gone_back_from_wait_a_day_and_then_twice_as_long() ->
 
 
 def test_a_misfit_is_diagnosed_each_time_that_it_has_lasted_twice_as_long() -> None:
-    tables, state, began = Loop(policy="adopt", misfit_h=3.0, every_h=24, at_utc="00:00"), LoopState(), []
+    tables, state, began = LoopSettings(policy="adopt", misfit_h=3.0, every_h=24, at_utc="00:00"), LoopState(), []
     for minute in range(1, 23 * 60):
         state.misfit_min, now_ns = float(minute), minute * HOUR_NS // 60
         if begin_if_due(state, tables, now_ns, pass_planned(state, tables, now_ns)):
@@ -164,7 +164,7 @@ def test_a_fault_of_a_couple_that_begins_in_a_shadow_makes_no_better_model(fault
         if i >= FIRST + 240:
             fault(values)
 
-    loop = LoopRun(settings(), QUILL, Night(shown(extended(1.0))))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended(1.0))))
     steps = run(loop, machine(FIRST + 1440, acts=lambda i: 0.0, change=change))
     found = [step for _, step, _ in decisions(steps)]
     assert "shadow" in found and "adopt" not in found and loop.effects == ()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from compensator.clock import NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.errors import ModelError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.model.effects import effect_from
@@ -20,10 +20,10 @@ from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.recording.reading import messages, recordings
 from compensator.service.loop.avoided import avoid
-from compensator.service.loop.loop import Loop
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.decisions import LoopDecisions
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.schedule import begin_if_due
-from compensator.service.loop.state import LoopState, Place, Role
+from compensator.service.loop.state import InShadow, LoopState, Role
 from compensator.service.loop.weighing import failed, weigh, without_effect
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE, largest_step
@@ -58,7 +58,7 @@ NIGHTLY = {"policy": "adopt", "every_h": 24, "shadow_h": 6.0}
 def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() -> None:
     """The coolant stops to act a day after the adoption; the gain stays. No diagnosis finds it."""
     ends, night = 2 * DAY, Night(shown(BOTH))
-    loop = LoopRun(settings(loop=NIGHTLY, **CHECKED), QUILL_FILE, night)
+    loop = OfflineLoop(settings(loop=NIGHTLY, **CHECKED), QUILL_FILE, night)
     source = machine(4 * DAY, lambda i: float(i < ends), more=grown(0.2))
     steps = run(loop, source)
     (back,) = [seq for seq, step, _ in decisions(steps) if step == "back"]
@@ -81,7 +81,7 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
     """It does not know its level: measured Y was shifted before. The present level stays."""
     gain = grown(0.2)
     ends, night = 2 * DAY, Night(shown(BOTH))
-    loop = LoopRun(settings(loop=NIGHTLY | {"policy": policy, "every_h": 12}), QUILL_FILE, night)
+    loop = OfflineLoop(settings(loop=NIGHTLY | {"policy": policy, "every_h": 12}), QUILL_FILE, night)
     source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: gain(i) + 8.0 * (i > 300))
     steps = run(loop, source, 1)
     while len(loop.effects) < 2:
@@ -96,7 +96,7 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
         assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 2 :])) < 1.0
 
 
-def misfit(*places: Place, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
+def misfit(*places: InShadow, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
     """The state of a loop whose model has erred for four hours; the loop has added its effects."""
     last = {"misfit_min": 240.0, "planned_utc_ns": NOW_NS, "adopted_utc_ns": NOW_NS - 24 * HOUR_NS}
     return LoopState(effects=effects, found=list(places), **(last | changes))
@@ -112,8 +112,8 @@ def begun(state: LoopState, after_h: float = 0.0) -> tuple[str, str]:
     return found.why, found.without
 
 
-def one(name: str, *effects: str, role: Role = "before", deviations: float | None = None) -> Place:
-    found = Place(sha256=name * 64, effects=list(effects), role=role, since_utc_ns=NOW_NS)
+def one(name: str, *effects: str, role: Role = "before", deviations: float | None = None) -> InShadow:
+    found = InShadow(sha256=name * 64, effects=list(effects), role=role, since_utc_ns=NOW_NS)
     found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations, hours=8.0)
     return found
 
@@ -153,11 +153,11 @@ def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
     assert begun(misfit(effects=[])) == ("misfit", "")
     assert begun(misfit(base_effects=EFFECTS[:1])) == ("misfit", "gain:DTF")
     # The loop had adopted it, and then a person takes it for the calibrated model.
-    loop = Loop(LoopSettings(), 60.0, EFFECTS, misfit())
+    loop = LoopDecisions(LoopSettings(), 60.0, EFFECTS, misfit())
     loop.model_changed(EFFECTS, NOW_NS, calibrated=EFFECTS)
     assert begun(loop.state) == ("misfit", "")
     # Back to what the loop had adopted before, these are still its own.
-    loop = Loop(LoopSettings(), 60.0, [*EFFECTS, "delay:DTF"], misfit())
+    loop = LoopDecisions(LoopSettings(), 60.0, [*EFFECTS, "delay:DTF"], misfit())
     loop.model_changed(EFFECTS, NOW_NS, calibrated=[], back=True)
     assert begun(loop.state) == ("misfit", EFFECTS[0])
 
@@ -167,7 +167,7 @@ def test_the_last_effect_ends_whether_the_model_before_it_is_still_watched_or_no
     """The diagnoses name it all the time: most of their records have it. So has what was compared until the misfit."""
     ends = 3 * DAY
     tables = {"loop": NIGHTLY | {"watch_h": watch_h}} | CHECKED
-    loop = LoopRun(settings(**tables), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(**tables), QUILL_FILE, Night(shown(extended())))
     steps = run(loop, machine(4 * DAY, lambda i: float(i < ends)))
     found = decisions(steps)
     (back,) = [seq for seq, step, _ in found if step == "back"]
@@ -181,7 +181,7 @@ def test_what_is_interrupted_is_begun_again(how: str) -> None:
     state = misfit()
     begun(state)
     begin_if_due(state, LoopSettings(), NOW_NS, NOW_NS)
-    loop = Loop(LoopSettings(policy="adopt"), 60.0, EFFECTS, state)
+    loop = LoopDecisions(LoopSettings(policy="adopt"), 60.0, EFFECTS, state)
     assert loop.wanted is not None and loop.wanted.without == "gain:DTF"
     if how == "restart":
         assert loop.restarted() == []
@@ -198,7 +198,7 @@ def test_what_is_interrupted_is_begun_again(how: str) -> None:
 def test_one_that_fails_is_not_begun_again_before_the_next_diagnosis() -> None:
     state = misfit()
     begin_if_due(state, LoopSettings(), NOW_NS, NOW_NS)
-    loop = Loop(LoopSettings(), 60.0, EFFECTS, state)
+    loop = LoopDecisions(LoopSettings(), 60.0, EFFECTS, state)
     failure = weigh(failed("no disk", without=EFFECTS[0]), settings(), calibrated=QUILL_FILE, present=QUILL)
     (note,) = loop.receive(failure.data, NOW_NS)
     assert note.text == "the model without input:coolant_degc cannot be made: no disk"
@@ -209,7 +209,7 @@ def test_it_is_a_way_back_with_a_place_of_its_own() -> None:
     candidates = [one(name, f"gain:{name}", role="candidate", deviations=3.9) for name in "xyz"]
     state = misfit(*candidates)
     begin_if_due(state, LoopSettings(), NOW_NS, NOW_NS)
-    loop = Loop(LoopSettings(policy="propose"), 60.0, EFFECTS, state)
+    loop = LoopDecisions(LoopSettings(policy="propose"), 60.0, EFFECTS, state)
     less = DiagnosisData(
         verdict="", effects=["gain:DTF"], candidate_sha256="b" * 64, without="input:coolant_degc", fewer=True
     )
@@ -231,11 +231,11 @@ def test_it_is_a_way_back_with_a_place_of_its_own() -> None:
     ],
 )
 def test_beside_another_model_a_way_back_may_be_a_candidate_and_the_other_way_round(
-    incoming: list[str], place: Place, policy: Any, role: str
+    incoming: list[str], place: InShadow, policy: Any, role: str
 ) -> None:
-    place = msgspec.json.decode(msgspec.json.encode(place), type=Place)
-    other = Place(sha256="b" * 64, effects=incoming, role="candidate", since_utc_ns=NOW_NS)
-    loop = Loop(LoopSettings(policy=policy), 60.0, EFFECTS, misfit(place, other))
+    place = msgspec.json.decode(msgspec.json.encode(place), type=InShadow)
+    other = InShadow(sha256="b" * 64, effects=incoming, role="candidate", since_utc_ns=NOW_NS)
+    loop = LoopDecisions(LoopSettings(policy=policy), 60.0, EFFECTS, misfit(place, other))
     loop.state.exchange, loop.state.incoming = "adopt", other.sha256
     loop.exchanged(NOW_NS, "c" * 64)
     assert loop.state.found[0].role == role
@@ -243,15 +243,15 @@ def test_beside_another_model_a_way_back_may_be_a_candidate_and_the_other_way_ro
 
 def test_where_more_are_candidates_after_an_exchange_than_have_places_one_ends() -> None:
     places = [*(one(name, f"gain:{name}", role="candidate", deviations=2.0) for name in "xyz"), one("w", "gain:DTF")]
-    other = Place(sha256="b" * 64, effects=["input:coolant_degc"], role="before", since_utc_ns=NOW_NS)
-    loop = Loop(LoopSettings(policy="adopt"), 60.0, EFFECTS, misfit(*places, other))
+    other = InShadow(sha256="b" * 64, effects=["input:coolant_degc"], role="before", since_utc_ns=NOW_NS)
+    loop = LoopDecisions(LoopSettings(policy="adopt"), 60.0, EFFECTS, misfit(*places, other))
     loop.state.exchange, loop.state.incoming = "back", other.sha256
     assert about(loop.exchanged(NOW_NS, "c" * 64)) == [("end", "gives_way")] and len(loop.state.candidates) == 3
 
 
 def test_a_way_back_that_is_worse_ends_and_the_model_before_is_watched_on() -> None:
     state = misfit(one("a", "gain:DTF"), watched=one("b"), clean_min=30.0)
-    loop = Loop(LoopSettings(), 60.0, EFFECTS, state)
+    loop = LoopDecisions(LoopSettings(), 60.0, EFFECTS, state)
     for place in state.taken:
         place.verdict = ComparisonData(verdict=ComparisonVerdict.WORSE, deviations=-9.0, hours=8.0)
     assert [about(loop._decide(place, NOW_NS, is_judged=True)) for place in state.taken] == [[], [("end", "worse")]]

@@ -15,23 +15,23 @@ import pytest
 
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.config import Loop
+from compensator.config import LoopSettings
 from compensator.errors import DataError
 from compensator.events import ComparisonVerdict
 from compensator.model.model_file import parse_model
 from compensator.recording.container import Container
 from compensator.recording.reading import groups_of, recordings
 from compensator.service.compensation import Compensation
-from compensator.service.loop import loop as loop_module
+from compensator.service.loop import decisions as decisions_module
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero
-from compensator.service.loop.run import LoopRun
-from compensator.service.loop.state import NO_VERDICT, LoopState, Place, Running
+from compensator.service.loop.run import OfflineLoop
+from compensator.service.loop.state import NO_VERDICT, InShadow, LoopState, Running
 from compensator.service.loop.weighing import Diagnosed, without_candidate
 from compensator.service.replay import opening_of
-from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import second_opinion
+from compensator.service.transfer.two_models import BLOCK_NS, Block, ComparisonState
 from compensator.service.transfer.warm_up import warm_up
 from tests.service.living import MACHINE
 from tests.service.looping import (
@@ -61,7 +61,7 @@ def begun(i: int) -> float:
 
 
 def test_the_level_is_what_measured_y_shows_since_the_effect_began():
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     steps = run(loop, machine(3 * DAY, begun, change=warm_at_first))
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
     assert len(adopted) == 1 and adopted[0] < 2 * DAY
@@ -74,7 +74,7 @@ def test_the_level_is_what_measured_y_shows_since_the_effect_began():
 
 def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero_before():
     """The model is stored meanwhile, or the service was killed."""
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     samples = machine(3 * DAY, begun, change=warm_at_first)
     while not loop._core.state.exchange:
         loop.process(next(samples))
@@ -104,14 +104,14 @@ def test_what_a_model_leaves_while_its_state_is_not_known_is_none_of_its_errors(
 def test_a_mount_that_slips_beside_an_effect_that_acts_is_no_level_of_it(slip_min):
     """The effect acts all the time, and the mount slips by 8 µm: the level of the candidate is right, that of Y not."""
     slip = DAY // 2 + slip_min
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     steps = run(loop, machine(2 * DAY, more=lambda i: 8.0 * (i >= slip)))
     error = errors(steps)[-300:] - 8.0
     assert abs(np.mean(error)) < 4.0
 
 
 def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     samples = machine(3 * DAY, begun, more=crept, change=warm_at_first)
     steps = run(loop, samples, 2 * DAY)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
@@ -127,7 +127,7 @@ def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it
 
 
 def test_such_a_candidate_is_adopted_after_a_zero():
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     samples = machine(4 * DAY, begun, more=crept, change=warm_at_first)
     steps = run(loop, samples, 2 * DAY)
     assert loop.phase == "proposed"
@@ -144,7 +144,7 @@ def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level(
     """A diagnosis has named the drift: a candidate that follows it would be the better one about the zero, too."""
     found = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
     samples = machine(3 * DAY)
-    loop = LoopRun(settings(), QUILL_FILE, Night(found, shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(found, shown(extended())))
     steps = run(loop, samples, 2000)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
     loop.compensation.zero("warm")
@@ -156,7 +156,7 @@ def test_what_measured_y_did_before_the_last_zero_says_nothing_against_a_level_a
     """A mount slipped, a person set a zero: diagnoses go on naming the slip for as long as it is on record."""
     samples = machine(3 * DAY)
     night = Night(shown(None, "adequate"), shown(extended()))
-    loop = LoopRun(settings(), QUILL_FILE, night)
+    loop = OfflineLoop(settings(), QUILL_FILE, night)
     steps = run(loop, samples, 500)
     slipped = steps[-1].outcome.sample.time_utc_ns
     night.found[1] = dataclasses.replace(night.found[1], y_moved_utc_ns=slipped)
@@ -169,7 +169,7 @@ def test_what_measured_y_did_before_the_last_zero_says_nothing_against_a_level_a
 def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clearly_nearer(own_um, other_um, raised_um):
     blocks = [Block(0, n, 30, (0.0, 0.0), (own_um + 0.3 * (n % 2), other_um + 0.1 * (n % 2), 0.0)) for n in range(20)]
     verdict = msgspec.structs.replace(NO_VERDICT, verdict=ComparisonVerdict.BETTER, y_moved=True)
-    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1, verdict=verdict)
+    place = InShadow(sha256="b" * 64, effects=[], role="before", since_utc_ns=1, verdict=verdict)
     place.comparison = ComparisonState(blocks=blocks)
     found = Compared(place, settings().loop, 60.0, ErrorBlocks())
     assert found.level_at_return_um == pytest.approx(raised_um, abs=0.2)
@@ -187,7 +187,9 @@ def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clea
 def test_a_diagnosis_that_sees_the_time_and_finds_no_move_of_y_refutes_one(later, every_h, record_h, is_adopted):
     """The beginning of an effect was called a drift; half a day later the record is explained without one."""
     drifted = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
-    loop = LoopRun(settings(loop={"every_h": every_h, "record_h": record_h}), QUILL_FILE, Night(drifted, *[later] * 9))
+    loop = OfflineLoop(
+        settings(loop={"every_h": every_h, "record_h": record_h}), QUILL_FILE, Night(drifted, *[later] * 9)
+    )
     steps = run(loop, machine(3 * DAY), 2 * DAY)
     assert ("adopt" in [step for _, step, _ in decisions(steps)]) == is_adopted
 
@@ -199,7 +201,7 @@ def test_the_present_model_without_an_effect_refutes_no_move_of_y():
     for without, remains_ns in (("gain:DTF", moved_ns), ("", 0)):
         state = LoopState(zero_utc_ns=now_ns - 30 * hour_ns, y_moved_ns=moved_ns, time_utc_ns=now_ns)
         state.diagnosis = Running(from_utc_ns=now_ns - 36 * hour_ns, to_utc_ns=now_ns, why="misfit", without=without)
-        loop = loop_module.Loop(Loop(), 60.0, ["gain:DTF"], state)
+        loop = decisions_module.LoopDecisions(LoopSettings(), 60.0, ["gain:DTF"], state)
         loop.receive(without_candidate(Diagnosed("", (), None, "", without=without)), now_ns)
         assert state.y_moved_ns == remains_ns
 
@@ -208,7 +210,7 @@ def test_newer_parameters_of_the_present_effects_show_no_level():
     """What begins then is none of them: a mount that slips is no reason to raise their level."""
     present, other = ([(n, 0.2 * (n % 2) if n < 12 else 9.0 + k * (n % 2)) for n in range(40)] for k in (1.0, 0.2))
     other = [(n, 6.0 * (n % 2) if n < 12 else left) for n, left in other]
-    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
     place.error = ErrorBlocks(blocks=other)
     shown_um = [
         Compared(place, settings().loop, 60.0, ErrorBlocks(blocks=present), same=same).shown_level_um
@@ -235,7 +237,7 @@ def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
     off_at_zero, zero_channels, y_moved, rms_um, level_um
 ):
     verdict = msgspec.structs.replace(NO_VERDICT, present_rms_um=4.0, candidate_rms_um=rms_um, measured_by="sensor")
-    place = Place(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
+    place = InShadow(sha256="b" * 64, effects=["input:spindle_rpm"], role="candidate", since_utc_ns=1, verdict=verdict)
     place.off_at_zero = off_at_zero
     began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
     place.error = ErrorBlocks(blocks=[(n, 6.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
@@ -247,7 +249,7 @@ def test_what_adds_nothing_at_rest_has_the_level_of_a_zero_at_rest(
 
 
 def test_channels_that_read_0_at_a_zero_at_rest_are_known(tmp_path):
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     steps = run(loop, machine(600, change=lambda i, values: values.update(coolant_degc=0.0 if i < 300 else 20.0)), 200)
     at_rest = next(step for step in steps if any(note.kind == "zero" for note in step.outcome.notes))
     assert channels_at_zero(at_rest.outcome) == ["coolant_degc"] == loop._core.state.zero_channels
@@ -271,7 +273,7 @@ def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, o
     """An effect has ended on a machine at rest: nothing changes any longer that could show it."""
     before = ErrorBlocks(blocks=[(n, before_um) for n in range(-20, blocks) if before_um is not None])
     means = [(own_um + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(blocks)]
-    place = Place(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=[], role="before", since_utc_ns=1)
     place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
     found = Compared(place, settings().loop, 60.0, before)
     assert found.is_better_to_go_back_to(is_new=False) is is_right
@@ -284,7 +286,7 @@ def test_a_way_back_that_alone_is_right_about_the_zero_is_gone_back_to(own_um, o
 def test_newer_parameters_that_alone_are_right_about_the_zero_are_better(other_um, same, y_moved, is_better):
     """The present ones leave nearly a constant, which changes do not show."""
     means = [(2.4 + 0.1 * (n % 2), other_um, 0.01 * n) for n in range(30)]
-    place = Place(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
+    place = InShadow(sha256="b" * 64, effects=["gain:DTF"], role="candidate", since_utc_ns=1)
     place.comparison = ComparisonState(blocks=[Block(0, n, 30, (0.0, 0.0), one) for n, one in enumerate(means)])
     present = ErrorBlocks(blocks=[(n, 2.4) for n in range(-20, 30)])
     found = Compared(place, settings().loop, 60.0, present, same=same, y_moved=y_moved)
@@ -293,8 +295,8 @@ def test_newer_parameters_that_alone_are_right_about_the_zero_are_better(other_u
 
 def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):
     wrong = 1600
-    monkeypatch.setattr(loop_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)
-    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended()), shown(None, "adequate")))
+    monkeypatch.setattr(decisions_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended()), shown(None, "adequate")))
     steps = run(loop, machine(2 * DAY))
     found = [(seq, step, why) for seq, step, why in decisions(steps) if step in ("shadow", "end", "adopt")]
     assert [step for _, step, _ in found] == ["shadow", "end"] and found[1][::2] == (wrong, "was_wrong")
@@ -376,10 +378,10 @@ def test_what_was_shown_of_the_level_goes_on_with_other_parameters_that_leave_a_
 
     present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in range(until)])
     before, after = (
-        Place(sha256=sha, effects=["delay:DTF"], role="candidate", since_utc_ns=at * BLOCK_NS, error=errors_of(left))
+        InShadow(sha256=sha, effects=["delay:DTF"], role="candidate", since_utc_ns=at * BLOCK_NS, error=errors_of(left))
         for sha, at, left in (("a", since, first), ("b", now, second))
     )
-    compared = Compared(after, Loop(), 60.0, present)
+    compared = Compared(after, LoopSettings(), 60.0, present)
     compared.go_on_with(before, now * BLOCK_NS)
     assert after.level_utc_ns == (since * BLOCK_NS if goes_on else 0)
     assert compared.shown_level_um == (6.3 if goes_on else None)
@@ -394,12 +396,12 @@ def test_that_an_effect_began_is_seen_in_what_older_parameters_left_before_the_r
     times = [*range(stops), *range(goes_on, until)]
     present = ErrorBlocks(blocks=[(n, 0.1 * (n % 2) if n < begins else 7.0 + n % 2) for n in times])
     left = [(n, 6.0 * (n % 2) if n < begins else 6.0) for n in times]
-    before = Place(sha256="a", effects=["delay:DTF"], role="candidate", since_utc_ns=stops * BLOCK_NS)
+    before = InShadow(sha256="a", effects=["delay:DTF"], role="candidate", since_utc_ns=stops * BLOCK_NS)
     before.error = ErrorBlocks(blocks=left[: -until + goes_on + 10])
     now = goes_on + 10
-    after = Place(sha256="b", effects=["delay:DTF"], role="candidate", since_utc_ns=now * BLOCK_NS)
+    after = InShadow(sha256="b", effects=["delay:DTF"], role="candidate", since_utc_ns=now * BLOCK_NS)
     after.error = ErrorBlocks(blocks=[one for one in left if goes_on <= one[0]])
-    compared = Compared(after, Loop(), 60.0, present)
+    compared = Compared(after, LoopSettings(), 60.0, present)
     assert compared.shown_level_um is None
     compared.go_on_with(before, now * BLOCK_NS)
     assert compared.shown_level_um == 6.0

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from compensator.service.loop.place import LEADS
-from compensator.service.loop.run import LoopRun, LoopStep
-from compensator.service.transfer.comparison import DEVIATIONS
+from compensator.service.loop.run import LoopStep, OfflineLoop
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.two_models import DEVIATIONS
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown, stronger
 from tests.service.test_loop_run import CHECKED, NIGHT
 from tests.service.test_loop_service import Asked, Looping, checked, in_phase
@@ -21,9 +21,9 @@ PROPOSING = {"policy": "propose", "shadow_h": 6.0, "record_h": 12.0}
 RIGHT_H = 12
 
 
-def proposing(left: float, *, noise_um: float = 1.5) -> tuple[LoopRun, list[LoopStep]]:
+def proposing(left: float, *, noise_um: float = 1.5) -> tuple[OfflineLoop, list[LoopStep]]:
     """Run a candidate that is right for some hours; then its effect acts by a part only."""
-    loop = LoopRun(settings(loop=PROPOSING), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(loop=PROPOSING), QUILL, Night(shown(extended())))
     ends = NIGHT + 60 * RIGHT_H
     source = machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else left, noise_um=noise_um)
     return loop, run(loop, source)
@@ -58,7 +58,7 @@ def test_a_proposal_stands_on_no_evidence_that_a_suspected_sensor_has_given() ->
             values["t_q_degc"] += 0.03 * (i - begins)
 
     tables = CHECKED | {"loop": PROPOSING}
-    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended())))
     steps = run(loop, machine(begins + 360, acts=lambda i: float(i >= NIGHT), change=drifting))
     assert about_it(steps) == ["propose", "withdraw"]
     (text,) = (note.text for step in steps for note in step.events if "withdrawn" in note.text)
@@ -67,13 +67,13 @@ def test_a_proposal_stands_on_no_evidence_that_a_suspected_sensor_has_given() ->
 
 def test_a_proposal_whose_evidence_hovers_is_the_same_after_a_kill() -> None:
     night = Night(shown(extended()))
-    loop = LoopRun(settings(loop=PROPOSING), QUILL, night)
+    loop = OfflineLoop(settings(loop=PROPOSING), QUILL, night)
     ends = NIGHT + 60 * RIGHT_H
     source = machine(NIGHT + 5 * DAY // 2, acts=lambda i: 1.0 if i < ends else 0.5, noise_um=1.5)
     run(loop, source, NIGHT + 2 * DAY)
     (proposed,) = loop._core.state.found
     assert loop.phase == "proposed" and proposed.verdict.verdict == "alike"
-    resumed = LoopRun(settings(loop=PROPOSING), QUILL, night)
+    resumed = OfflineLoop(settings(loop=PROPOSING), QUILL, night)
     resumed.restore(loop.state())
     assert resumed.phase == "proposed"
     source, again = itertools.tee(source)
@@ -106,7 +106,7 @@ async def test_the_service_keeps_it_over_a_kill_and_a_replay_makes_it_again(tmp_
 def test_a_proposal_stays_while_later_diagnoses_find_the_same_effects() -> None:
     """Whoever reads it in the morning can still say yes at noon."""
     night = Night(shown(extended()), shown(extended(2.9)), shown(extended(3.1)))
-    loop = LoopRun(settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0}), QUILL, night)
+    loop = OfflineLoop(settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0}), QUILL, night)
     steps = run(loop, machine(3 * DAY))
     found = [decision[1:] for decision in decisions(steps)]
     after = found[found.index(("propose", "")) + 1 :]
@@ -116,7 +116,9 @@ def test_a_proposal_stays_while_later_diagnoses_find_the_same_effects() -> None:
 
 def test_a_proposal_stays_beside_others_of_later_diagnoses_until_nobody_has_answered_for_long() -> None:
     night = Night(shown(extended()), shown(stronger(0.1)))
-    loop = LoopRun(settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0, "watch_h": 36.0}), QUILL, night)
+    loop = OfflineLoop(
+        settings(loop={"policy": "propose", "every_h": 12, "shadow_h": 6.0, "watch_h": 36.0}), QUILL, night
+    )
     steps = run(loop, machine(3 * DAY))
     found = [decision[1:] for decision in decisions(steps)]
     after = found[found.index(("propose", "")) + 1 :]

@@ -13,7 +13,7 @@ from compensator.errors import DataError
 from compensator.messages import number
 from compensator.service.loop.job import Job, read_record
 from compensator.service.loop.record import table_of_rows, usable_table
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from tests.service.living import MACHINE
 from tests.service.looping import Night, machine, shown
 from tests.service.test_loop_run import probed, without_sensor
@@ -24,7 +24,7 @@ from tests.service.test_restart import QUILL
 @pytest.mark.parametrize("zero_at", [400, 1000])
 def test_probes_about_each_zero_are_diagnosed(zero_at: int) -> None:
     samples, every = 1441, 30
-    loop = LoopRun(without_sensor(), QUILL, Night(shown(None, "adequate")))
+    loop = OfflineLoop(without_sensor(), QUILL, Night(shown(None, "adequate")))
     source = machine(samples, noise_um=0.0)
     truth: list[float] = []
 

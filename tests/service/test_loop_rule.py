@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.run import LoopRun
-from compensator.service.loop.state import Place
-from compensator.service.transfer.comparison import BLOCK_NS, SURE_PART, Block, ComparisonState
-from compensator.service.transfer.evidence import evidence
+from compensator.service.loop.run import OfflineLoop
+from compensator.service.loop.state import InShadow
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.refutation import evidence
+from compensator.service.transfer.two_models import BLOCK_NS, SURE_PART, Block, ComparisonState
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
 from tests.service.test_loop_watch import HOUR_NS, follows, watching
 from tests.service.test_restart import QUILL
@@ -54,7 +54,7 @@ def test_a_candidate_that_is_neither_better_nor_worse_is_refused_more_often_than
 
 def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> None:
     night = Night(shown(extended(2.0)), shown(extended()))
-    loop = LoopRun(settings(**SHORT), QUILL, night)
+    loop = OfflineLoop(settings(**SHORT), QUILL, night)
     steps = run(loop, machine(2 * DAY, noise_um=NOISY_UM))
     found = [decision for decision in decisions(steps) if decision[1] in ("shadow", "adopt")]
     assert [step for _, step, _ in found] == ["shadow", "shadow", "adopt"]
@@ -67,7 +67,7 @@ def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> No
 
 
 def test_what_an_earlier_candidate_has_shown_adopts_none_that_is_worse() -> None:
-    loop = LoopRun(settings(**SHORT), QUILL, Night(shown(extended()), shown(extended(7.0))))
+    loop = OfflineLoop(settings(**SHORT), QUILL, Night(shown(extended()), shown(extended(7.0))))
     steps = run(loop, machine(DAY + 600, noise_um=NOISY_UM))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
@@ -91,7 +91,7 @@ def test_a_candidate_with_other_effects_takes_a_free_place_and_what_others_have_
 def taken_over(blocks: int, own: int, wrong: float) -> Compared:
     """What is compared of newer parameters, with as many blocks before them and as many of their own."""
     rng = np.random.default_rng(9)
-    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=blocks * BLOCK_NS)
+    place = InShadow(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=blocks * BLOCK_NS)
     for n in range(blocks + own):
         moves, error = 2.0 * float(rng.normal()), 2.0 * float(rng.normal())
         means = (error, error - wrong * moves, moves)
@@ -113,7 +113,7 @@ def test_before_their_own_hours_judge_all_hours_are_said_and_end_nothing(own: in
 
 def test_two_candidates_are_compared_by_blocks_of_the_same_samples() -> None:
     """A zero divides the half hour 3 for both; in the half hour 6 the second one has taken over."""
-    compared = [Place(sha256=name * 64, effects=[], role="candidate", since_utc_ns=1) for name in "ab"]
+    compared = [InShadow(sha256=name * 64, effects=[], role="candidate", since_utc_ns=1) for name in "ab"]
     for place, by in zip(compared, (1.0, 2.0), strict=True):
         parts = [(0, 2), (0, 3), (1, 3), (1, 4), (1, 5), *([(1, 6)] if by == 1.0 else [(1, 6), (2, 6)]), (2, 7)]
         means = [(0.0, by * (10 * zero + number), 0.0) for zero, number in parts]
@@ -125,7 +125,7 @@ def test_two_candidates_are_compared_by_blocks_of_the_same_samples() -> None:
     assert len({block.zeros for block in state.blocks}) == 3
 
 
-def beside_state(place: Place, rival: Place) -> ComparisonState:
+def beside_state(place: InShadow, rival: InShadow) -> ComparisonState:
     Compared(place, LoopSettings(), 60.0, ErrorBlocks()).go_on_beside(rival, 0.0)
     return place.comparison
 
@@ -135,7 +135,7 @@ def test_newer_parameters_are_judged_by_all_hours_or_by_their_own_whichever_show
     """The effect acts all the time, or from the beginning of their own hours on."""
     takes_over, now = 40, 56
     rng = np.random.default_rng(8)
-    place = Place(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
+    place = InShadow(sha256="b" * 64, effects=["delay:DTF"], role="candidate", since_utc_ns=takes_over * BLOCK_NS)
     for n in range(now):
         moves, error = 2.0 * float(rng.normal()), 0.3 * float(rng.normal())
         own, other = (moves + error, error) if n >= right_from else (error, error - moves)

@@ -19,7 +19,7 @@ from compensator.events import EventKind
 from compensator.messages import ProbeRequest, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.service.loop.record import usable_table
-from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep, warmed_on
+from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop, warmed_on
 from compensator.service.loop.trust import is_alarmed
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of
@@ -35,7 +35,7 @@ NIGHT = 20 * 60
 
 def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> None:
     night = Night(shown(extended()))
-    loop = LoopRun(settings(), QUILL, night)
+    loop = OfflineLoop(settings(), QUILL, night)
     steps = run(loop, machine(2 * DAY))
     found = decisions(steps)
     assert [step for _, step, _ in found[:3]] == ["diagnose", "shadow", "adopt"]
@@ -57,7 +57,7 @@ def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> No
 
 def test_a_candidate_that_is_worse_is_never_adopted() -> None:
     """The diagnosis has found the coolant, and today it does not act."""
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     steps = run(loop, machine(2 * DAY, acts=lambda i: float(i < NIGHT)))
     found = [decision[1:] for decision in decisions(steps)]
     assert ("end", "worse") in found and "adopt" not in [step for step, _ in found]
@@ -66,7 +66,7 @@ def test_a_candidate_that_is_worse_is_never_adopted() -> None:
 
 def test_a_candidate_without_a_clear_difference_ends_after_its_time() -> None:
     tables = {"loop": {"policy": "adopt", "shadow_h": 6.0, "watch_h": 24.0}}
-    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended(0.02, 0.001)), shown(None, "adequate")))
+    loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended(0.02, 0.001)), shown(None, "adequate")))
     steps = run(loop, machine(3 * DAY, acts=lambda i: 0.0))
     found = [decision[1:] for decision in decisions(steps)]
     assert ("end", "no_difference") in found and "adopt" not in [step for step, _ in found]
@@ -74,7 +74,7 @@ def test_a_candidate_without_a_clear_difference_ends_after_its_time() -> None:
 
 def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
     night = Night(shown(extended()), shown(extended()))
-    loop = LoopRun(settings(), QUILL, night)
+    loop = OfflineLoop(settings(), QUILL, night)
     ends = 2 * DAY
     steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
     found = [(seq, step) for seq, step, _ in decisions(steps) if step in ("adopt", "back")]
@@ -95,7 +95,7 @@ def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
 )
 def test_a_diagnosis_that_explains_nothing_brings_the_calibrated_model_into_shadow(later: Diagnosed) -> None:
     night = Night(shown(extended()), later)
-    loop = LoopRun(settings(), QUILL, night)
+    loop = OfflineLoop(settings(), QUILL, night)
     ends = 32 * 60
     steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
     found = decisions(steps)
@@ -105,7 +105,7 @@ def test_a_diagnosis_that_explains_nothing_brings_the_calibrated_model_into_shad
 
 @pytest.mark.parametrize("verdict", ["unexplained", "failed"])
 def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) -> None:
-    loop = LoopRun(settings(), QUILL, Night(Diagnosed(verdict, (), None, "text", "look at the sensor")))
+    loop = OfflineLoop(settings(), QUILL, Night(Diagnosed(verdict, (), None, "text", "look at the sensor")))
     steps = run(loop, machine(DAY + 1))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", verdict)]
     assert not any(step.candidates for step in steps)
@@ -123,14 +123,14 @@ def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) ->
 )
 def test_rubbish_is_refused(model: bytes, why: str) -> None:
     found = Diagnosed("explained", ("input:coolant_degc",), model, "text")
-    loop = LoopRun(settings(), QUILL, Night(found))
+    loop = OfflineLoop(settings(), QUILL, Night(found))
     steps = run(loop, machine(DAY + 1))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", why)]
 
 
 def test_an_effect_of_the_measurement_is_never_part_of_a_candidate() -> None:
     drift = b'\n[[effect]]\nkind = "drift"\nrate_um_per_h = 0.2\n'
-    loop = LoopRun(settings(), QUILL, Night(Diagnosed("explained", ("drift",), QUILL + drift, "text")))
+    loop = OfflineLoop(settings(), QUILL, Night(Diagnosed("explained", ("drift",), QUILL + drift, "text")))
     steps = run(loop, machine(DAY + 1))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", "refused")]
 
@@ -146,7 +146,7 @@ def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -
         if begins <= i < ends:
             values["t_q_degc"] += 0.02 * (i - begins)
 
-    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(**CHECKED), QUILL, Night(shown(extended())))
     source = machine(3 * DAY, acts=lambda i: float(i >= NIGHT), change=drifting)
     steps = run(loop, source)
     hours = [one.hours for step in steps for one in step.candidates if one.role == "candidate"]
@@ -162,7 +162,7 @@ def adopted_at(loses: Callable[[int], bool]) -> int:
         if loses(i):
             values["t_q_degc"] = math.nan
 
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     return next(seq for seq, step, _ in decisions(run(loop, machine(2 * DAY, change=losing))) if step == "adopt")
 
 
@@ -176,7 +176,7 @@ def test_what_a_line_loses_now_and_then_keeps_nothing_from_being_decided() -> No
 
 def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_fault_of_a_sensor() -> None:
     """To a check that knows one model a missing effect looks like a sensor that drifts."""
-    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(**CHECKED), QUILL, Night(shown(extended())))
     steps = run(loop, machine(NIGHT + 60))
     alarmed = [step for step in steps if sensor_suspected(step.outcome.offset.reasons)]
     assert len(alarmed) > 240
@@ -190,13 +190,13 @@ def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_f
 def test_a_creeping_mount_does_not_make_a_better_model() -> None:
     """From the night on Y creeps by 1 µm/h; the candidate explains it by the coolant, which does not act."""
     creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
-    loop = LoopRun(settings(), QUILL, Night(shown(extended(1.0))))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended(1.0))))
     steps = run(loop, machine(2 * DAY, acts=lambda i: 0.0, more=creep))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
 def test_a_hand_on_the_machine_is_not_compared() -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     source = machine(3 * DAY)
     run(loop, source, NIGHT + 60)
     (before,) = run(loop, source, 1)[0].candidates
@@ -210,7 +210,7 @@ def test_a_hand_on_the_machine_is_not_compared() -> None:
 
 def test_after_an_adoption_under_a_hand_the_model_before_is_watched_all_the_same() -> None:
     tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
-    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended())))
     ends = NIGHT + 600
     source = machine(NIGHT + 1800, acts=lambda i: float(i < ends))
     run(loop, source, NIGHT + 420)
@@ -228,7 +228,7 @@ def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
         if i > NIGHT + 30:
             values["coolant_degc"] = math.nan
 
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
     steps = run(loop, machine(2 * DAY, change=missing))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
     last = [one for step in steps for one in step.candidates][-1]
@@ -241,7 +241,7 @@ def test_no_diagnosis_while_sensors_contradict_each_other_or_a_temperature_is_mi
             values["at_degc"] = math.nan
 
     night = Night(shown(None, "adequate"))
-    steps = run(LoopRun(settings(), QUILL, night), machine(NIGHT + 200, acts=lambda i: 0.0, change=missing))
+    steps = run(OfflineLoop(settings(), QUILL, night), machine(NIGHT + 200, acts=lambda i: 0.0, change=missing))
     assert NIGHT + 90 + 29 <= decisions(steps)[0][0] <= NIGHT + 90 + 31 and len(night.asked) == 1
 
 
@@ -249,8 +249,8 @@ def test_no_diagnosis_while_sensors_contradict_each_other_or_a_temperature_is_mi
 def test_a_run_continues_from_its_state_with_the_same_bits(lost: tuple[str, ...]) -> None:
     """Also where a channel was missing for ten minutes before it: its state then has values that are missing."""
 
-    def whole() -> LoopRun:
-        return LoopRun(settings(), QUILL, Night(shown(extended())))
+    def whole() -> OfflineLoop:
+        return OfflineLoop(settings(), QUILL, Night(shown(extended())))
 
     def losing(i: int, values: dict[str, float]) -> None:
         if NIGHT + 285 <= i < NIGHT + 295:
@@ -268,11 +268,11 @@ def test_a_run_continues_from_its_state_with_the_same_bits(lost: tuple[str, ...]
 
 def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
     night = Night(shown(extended()))
-    loop = LoopRun(settings(), QUILL, night)
+    loop = OfflineLoop(settings(), QUILL, night)
     source = machine(DAY + 60)
     run(loop, source, NIGHT + 1)
     assert len(night.asked) == 1
-    again = LoopRun(settings(), QUILL, night)
+    again = OfflineLoop(settings(), QUILL, night)
     again.restore(loop.state())
     steps = run(again, source, 3)
     assert len(night.asked) == 2 and steps[-1].candidates
@@ -280,7 +280,7 @@ def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
 
 def test_a_candidate_that_is_new_passes_a_pause_too() -> None:
     """The diagnosis has ended with the last sample before it."""
-    loop, samples = LoopRun(settings(), QUILL, Night(shown(extended()))), machine(NIGHT + 120)
+    loop, samples = OfflineLoop(settings(), QUILL, Night(shown(extended()))), machine(NIGHT + 120)
     steps = [loop.process(sample) for sample in itertools.islice(samples, NIGHT - 30)]
     while ("diagnose", "planned") not in [found[1:] for found in decisions(steps)]:
         steps.append(loop.process(next(samples)))
@@ -295,7 +295,7 @@ def test_a_candidate_that_is_new_passes_a_pause_too() -> None:
 
 def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
     tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
-    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended())))
     ends = NIGHT + 480
     steps = run(loop, machine(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
     found = [decision[1:] for decision in decisions(steps)]
@@ -305,7 +305,7 @@ def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
 
 
 def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
-    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(None, "adequate")))
+    loop = OfflineLoop(settings(**CHECKED), QUILL, Night(shown(None, "adequate")))
     source = machine(900)
     steps = run(loop, source, 300)
     loop.hold()
@@ -324,7 +324,7 @@ def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
 PROBED = {"probe": {"std_um": 0.5, "measured_max_um": 80.0, "largest_um": 60.0}}
 
 
-def probed(loop: LoopRun, samples: Iterator[Sample], every: int, seed: int = 3) -> list[LoopStep]:
+def probed(loop: OfflineLoop, samples: Iterator[Sample], every: int, seed: int = 3) -> list[LoopStep]:
     """Run a machine without a displacement sensor, whose Y is probed now and then."""
     rng, steps, known = np.random.default_rng(seed), list[LoopStep](), 0.0
     for i, one in enumerate(samples):
@@ -357,7 +357,7 @@ def without_sensor(**changes: Any) -> Config:
 def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice(y_moved_utc_ns: int) -> None:
     """A drift that is named is no reason to wait for a zero: what creeps both models are corrected for."""
     found_by_night = dataclasses.replace(shown(extended()), y_moved_utc_ns=y_moved_utc_ns)
-    loop = LoopRun(without_sensor(), QUILL, Night(found_by_night))
+    loop = OfflineLoop(without_sensor(), QUILL, Night(found_by_night))
     source = list(machine(int(2.4 * DAY), noise_um=0.0))
     steps = probed(loop, iter(source), 30)
     assert sum(probe.taken for step in steps for probe in step.outcome.probes) > 40
@@ -379,7 +379,7 @@ def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twic
 
 
 def test_from_probes_alone_a_false_candidate_is_not_adopted() -> None:
-    loop = LoopRun(without_sensor(), QUILL, Night(shown(extended())))
+    loop = OfflineLoop(without_sensor(), QUILL, Night(shown(extended())))
     steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0), 30)
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
@@ -389,7 +389,7 @@ def test_a_probe_mount_that_creeps_does_not_make_a_better_model() -> None:
     creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
     tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
     for gain in (1.0, -1.0):
-        loop = LoopRun(without_sensor(**tables), QUILL, Night(shown(extended(gain))))
+        loop = OfflineLoop(without_sensor(**tables), QUILL, Night(shown(extended(gain))))
         steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0, more=creep), 30)
         assert sum(probe.taken for step in steps[NIGHT:] for probe in step.outcome.probes) > 20
         assert "adopt" not in [step for _, step, _ in decisions(steps)]

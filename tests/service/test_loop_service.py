@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from compensator.api import shop
+from compensator.audit.machine_audit import audit, summary
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
-from compensator.audit.series import audit, summary
 from compensator.clock import NS
 from compensator.config import Config, parse_config
 from compensator.events import ComparisonData, EventKind, NotJudged
@@ -31,16 +31,16 @@ from compensator.recording.reading import RawRecord, groups_of, messages, record
 from compensator.service.event_log import EventLog
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.process import DiagnosisProcess
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import LoopState, Running, decode_loop
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer import adoption, model_store
-from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.shadow import Shadow
+from compensator.service.transfer.two_models import not_judged
 from compensator.watch.history import STEP_NS, MachineHistory
 from compensator.watch.past import last_day
 from tests.audit.made import CONFIG
@@ -615,11 +615,11 @@ async def test_a_loop_of_a_shop_decides_by_the_settings_of_a_table_that_is_off(
     await machine.run(5)
     used: list[Config] = []
 
-    def seen(config: Config, *others: Any) -> LoopRun:
+    def seen(config: Config, *others: Any) -> OfflineLoop:
         used.append(config)
-        return LoopRun(config, *others)
+        return OfflineLoop(config, *others)
 
-    monkeypatch.setattr(shop, "LoopRun", seen)
+    monkeypatch.setattr(shop, "OfflineLoop", seen)
     assert not shop.loop_of_machine(machine.recordings, "propose").error
     assert machine.config.loop is not None
     assert [one.loop for one in used] == [msgspec.structs.replace(machine.config.loop, policy="propose")]

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from compensator.clock import NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData
 from compensator.recording.reading import messages, recordings
-from compensator.service.loop.core import ModelLoop
-from compensator.service.loop.loop import Loop
+from compensator.service.loop.core import ShadowedLoop
+from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.proof import CANDIDATES, shared
-from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
-from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop
+from compensator.service.loop.state import InShadow, LoopState, Running
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
@@ -77,16 +77,16 @@ def stronger_dtf(change: float, acts: Callable[[int], bool]) -> Callable[[int], 
     return lambda i: crept(i) + gain(i) * acts(i)
 
 
-def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> Place:
-    found = Place(sha256=name * 64, effects=[f"gain:{name}"], role=role, since_utc_ns=NOW_NS - 8 * HOUR_NS)
+def place(name: str, deviations: float | None, *, role: Any = "candidate", hours: float = 8.0) -> InShadow:
+    found = InShadow(sha256=name * 64, effects=[f"gain:{name}"], role=role, since_utc_ns=NOW_NS - 8 * HOUR_NS)
     found.verdict = ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=deviations, hours=hours)
     return found
 
 
-def full(*places: Place, policy: Any = "adopt") -> Loop:
+def full(*places: InShadow, policy: Any = "adopt") -> LoopDecisions:
     """A loop all of whose places are taken, and a diagnosis that has ended."""
     diagnosis = Running(from_utc_ns=NOW_NS - 36 * HOUR_NS, to_utc_ns=NOW_NS, why="planned")
-    return Loop(LoopSettings(policy=policy), 60.0, [], LoopState(found=list(places), diagnosis=diagnosis))
+    return LoopDecisions(LoopSettings(policy=policy), 60.0, [], LoopState(found=list(places), diagnosis=diagnosis))
 
 
 def found(effects: list[str]) -> DiagnosisData:
@@ -133,7 +133,7 @@ def test_what_is_never_compared_keeps_no_place() -> None:
 class Stands:
     """Stands for what is compared of a candidate that is better than the present model."""
 
-    def __init__(self, one: Place, surpasses: str = "", level_um: float | None = 0.0) -> None:
+    def __init__(self, one: InShadow, surpasses: str = "", level_um: float | None = 0.0) -> None:
         self.one, self._surpasses, self.level_um, self.asked = one, surpasses, level_um, list[str]()
         self.level_at_adoption_um, self.shown_level_um = level_um or 0.0, level_um
         self.level_at_return_um, self.goes_back, self.is_alone_right = 0.0, True, False
@@ -144,7 +144,7 @@ class Stands:
     def is_better(self, now_ns: int) -> bool:
         return True
 
-    def beside(self, rival: Place) -> ComparisonData:
+    def beside(self, rival: InShadow) -> ComparisonData:
         self.asked.append(rival.sha256)
         if rival.sha256[0] not in self._surpasses:
             return ComparisonData(verdict=ComparisonVerdict.ALIKE, deviations=0.0, ratio=1.0)
@@ -260,7 +260,7 @@ def test_of_several_none_refutes_a_right_model_more_often_than_a_single_one_may(
 
 
 def test_the_right_candidate_is_adopted_although_a_later_diagnosis_names_another_effect() -> None:
-    loop = LoopRun(settings(loop=EARLY), QUILL_FILE, Night(shown(extended()), shown(stronger(0.1))))
+    loop = OfflineLoop(settings(loop=EARLY), QUILL_FILE, Night(shown(extended()), shown(stronger(0.1))))
     steps = run(loop, machine(2 * DAY))
     assert decided(steps)[:3] == [("shadow", ""), ("shadow", ""), ("adopt", "")] or decided(steps)[:4] == [
         ("shadow", ""),
@@ -274,7 +274,7 @@ def test_the_right_candidate_is_adopted_although_a_later_diagnosis_names_another
 def test_of_two_that_are_better_the_one_is_adopted_that_the_other_does_not_surpass() -> None:
     """Half of the effect beside a gain that is not there is better than nothing, and was there first."""
     half = together(extended(1.5), stronger(0.005))
-    loop = LoopRun(settings(loop=EARLY | {"every_h": 4}), QUILL_FILE, Night(shown(half), shown(extended())))
+    loop = OfflineLoop(settings(loop=EARLY | {"every_h": 4}), QUILL_FILE, Night(shown(half), shown(extended())))
     steps = run(loop, machine(2 * DAY))
     (adopted, *_) = events_of(steps, "adopt")
     assert adopted["model_sha256"] == sha256_of(extended())
@@ -283,8 +283,8 @@ def test_of_two_that_are_better_the_one_is_adopted_that_the_other_does_not_surpa
     assert {one.model_sha256: one.verdict for one in before.candidates}[sha256_of(half)] == "better"
 
 
-def adopting(*found: Diagnosed) -> LoopRun:
-    return LoopRun(settings(**TWICE), QUILL_FILE, Night(*found))
+def adopting(*found: Diagnosed) -> OfflineLoop:
+    return OfflineLoop(settings(**TWICE), QUILL_FILE, Night(*found))
 
 
 def test_a_proposal_stays_beside_what_explains_less_and_is_adopted_after_a_zero() -> None:
@@ -316,7 +316,7 @@ def test_a_second_effect_beside_the_first_is_proposed_in_its_place_and_says_on_w
 def test_after_an_adoption_the_others_go_on_beside_the_new_model_by_the_hours_of_both() -> None:
     """As if the adopted one had been the present model all the time."""
     other = together(extended(), stronger(0.02))
-    loop = LoopRun(settings(loop=EARLY | {"every_h": 4}), QUILL_FILE, Night(shown(extended()), shown(other)))
+    loop = OfflineLoop(settings(loop=EARLY | {"every_h": 4}), QUILL_FILE, Night(shown(extended()), shown(other)))
     source = machine(3 * DAY)
     steps = list[LoopStep]()
     while not steps or steps[-1].model_sha256 != sha256_of(extended()):
@@ -418,11 +418,11 @@ async def test_an_answer_to_a_candidate_that_has_given_its_place_is_refused(tmp_
     checked(service)
 
 
-def newer_parameters() -> Loop:
+def newer_parameters() -> LoopDecisions:
     """A loop with one candidate, and newer parameters of its effects that are warmed up."""
-    loop = Loop(settings().loop, 60.0, [])
+    loop = LoopDecisions(settings().loop, 60.0, [])
     effects = ["gain DTF", "input:coolant_degc"]
-    loop.state.found = [Place(sha256="a" * 64, effects=effects, role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
+    loop.state.found = [InShadow(sha256="a" * 64, effects=effects, role="candidate", since_utc_ns=NOW_NS - DAY_NS)]
     loop.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
     # A diagnosis lists them by what they remove.
     found = DiagnosisData(verdict="explained", candidate_sha256="b" * 64, effects=effects[::-1])
@@ -446,7 +446,7 @@ def test_newer_parameters_of_what_waits_for_a_zero_wait_for_it_too() -> None:
 
 def test_what_is_in_force_again_does_not_run_beside_itself() -> None:
     # Weighed beside another model; the service has gone back since.
-    core = ModelLoop(settings(), QUILL, {})
+    core = ShadowedLoop(settings(), QUILL, {})
     core.state.diagnosis = Running(from_utc_ns=0, to_utc_ns=NOW_NS, why="night")
     found = DiagnosisData(verdict="adequate", candidate_sha256=QUILL.sha256, calibrated=True, present_sha256="b" * 64)
     assert about(core.receive(found, NOW_NS)) == [("nothing", "replaced")]

@@ -9,7 +9,7 @@ import pytest
 from compensator.codes import Reason
 from compensator.model.model_file import parse_model
 from compensator.service.compensation import Compensation
-from compensator.service.loop.run import LoopRun, warmed_on
+from compensator.service.loop.run import OfflineLoop, warmed_on
 from compensator.service.outcome import Outcome, sets_zero_at_rest
 from compensator.service.transfer.shadow import Shadow
 from tests.service.looping import QUILL_FILE, Night, extended, machine, settings, shown, stronger
@@ -90,7 +90,7 @@ def test_a_restart_in_the_record_counts_although_numbers_go_on(kills: bool) -> N
     """A service that stands still leaves numbers out, one that was off does not; both are told of by `pause`."""
 
     def first_prediction(left_out: int) -> float:
-        loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+        loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
         for one in machine(4000):
             if 500 <= one.seq < 600:
                 continue
@@ -98,7 +98,7 @@ def test_a_restart_in_the_record_counts_although_numbers_go_on(kills: bool) -> N
                 loop.pause(100)
             if one.seq == 650 and kills:
                 state = loop.state()
-                loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+                loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
                 loop.restore(state)
             number = one.seq if one.seq < 600 else one.seq - 100 + left_out
             if candidates := loop.process(msgspec.structs.replace(one, seq=number)).candidates:

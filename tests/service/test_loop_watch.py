@@ -17,7 +17,7 @@ import pytest
 from msgspec.structs import replace
 
 from compensator.clock import NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, Note
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
@@ -25,11 +25,11 @@ from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
 from compensator.service.loop import live
 from compensator.service.loop.choice import Choice
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
+from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.found import Found
-from compensator.service.loop.loop import Loop
-from compensator.service.loop.run import LoopRun, LoopStep
-from compensator.service.loop.state import LoopState, Place, Running
+from compensator.service.loop.run import LoopStep, OfflineLoop
+from compensator.service.loop.state import InShadow, LoopState, Running
 from compensator.service.loop.weighing import Weighed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
@@ -54,9 +54,9 @@ SIX_HOURS = {"loop": {"policy": "adopt", "shadow_h": 6.0, "every_h": 4}}
 
 def adopted(
     night: Night, acts: Callable[[int], float], tables: Mapping[str, Any] = SIX_HOURS, **changes: Any
-) -> tuple[LoopRun, Iterator[Sample]]:
+) -> tuple[OfflineLoop, Iterator[Sample]]:
     """Run a machine until the first candidate is adopted; return the loop and the samples after it."""
-    loop, source = LoopRun(settings(**tables), QUILL, night), machine(4 * DAY, acts, **changes)
+    loop, source = OfflineLoop(settings(**tables), QUILL, night), machine(4 * DAY, acts, **changes)
     for one in source:
         loop.process(one)
         if loop.phase == "watching":
@@ -143,7 +143,7 @@ def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
     while len(run(loop, source, 1)[0].candidates) < 2:
         pass
     run(loop, source, 45)
-    resumed = LoopRun(settings(**SIX_HOURS), QUILL, night)
+    resumed = OfflineLoop(settings(**SIX_HOURS), QUILL, night)
     resumed.restore(loop.state())
     source, again = itertools.tee(source)
     for a, b in zip(run(loop, source, 60), run(resumed, again, 60), strict=True):
@@ -151,20 +151,20 @@ def test_both_shadows_continue_from_a_state_with_the_same_bits() -> None:
     assert len(a.candidates) == 2
 
 
-def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 0.0) -> tuple[Loop, int]:
+def watching(verdict: ComparisonData, *, hours: float = 30.0, misfit_h: float = 0.0) -> tuple[LoopDecisions, int]:
     """A loop so many hours after an adoption, with a diagnosis that has ended, and the time."""
     now_ns = ADOPTED_NS + round(hours * HOUR_NS)
-    before = Place(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
+    before = InShadow(sha256="a" * 64, effects=[], role="before", since_utc_ns=ADOPTED_NS, verdict=verdict)
     state = LoopState(
         watched=before,
         adopted_utc_ns=ADOPTED_NS,
         misfit_min=60.0 * misfit_h,
         diagnosis=Running(from_utc_ns=ADOPTED_NS, to_utc_ns=now_ns, why="planned"),
     )
-    return Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
+    return LoopDecisions(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
 
 
-def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
+def follows(loop: LoopDecisions, now_ns: int, *, same: bool = False) -> tuple[str, str]:
     """Return what follows from a diagnosis that has found another effect, or the same with other parameters."""
     found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
     found = replace(found, same_effects=same, change_deviations=9.0 if same else None)
@@ -196,7 +196,7 @@ def test_a_candidate_does_not_wait_for_the_model_before(verdict: ComparisonData,
     assert loop.state.phase == "shadow"
 
 
-def may_adopt(loop: Loop, now_ns: int) -> bool:
+def may_adopt(loop: LoopDecisions, now_ns: int) -> bool:
     """Return whether a candidate that is clearly better is adopted."""
     loop.shadow_begins("b" * 64, ["input:coolant_degc"], now_ns)
     (found,) = loop.state.found
@@ -266,7 +266,7 @@ def test_the_model_before_that_an_exchange_leaves_without_a_place_ends_with_an_e
     assert note.data["role"] == "before"
 
 
-def begun() -> tuple[Loop, int]:
+def begun() -> tuple[LoopDecisions, int]:
     """A loop that has said that a candidate begins before the next sample."""
     loop, now_ns = watching(judged(ALIKE, 0.5, 1.0))
     assert follows(loop, now_ns) == ("shadow", "") and loop.state.has_next
@@ -278,7 +278,7 @@ def begun() -> tuple[Loop, int]:
     [
         (lambda loop, now_ns: gone_back(loop, now_ns), "replaced"),
         (lambda loop, now_ns: loop.restarted(), "interrupted"),
-        (lambda loop, now_ns: loop.give_up_one("", "failed", "no memory"), "failed"),
+        (lambda loop, now_ns: loop.give_up_one("", "no memory"), "failed"),
         (lambda loop, now_ns: loop.model_changed([], now_ns, calibrated=[]), "by_hand"),
     ],
 )
@@ -292,7 +292,7 @@ def test_what_was_said_to_begin_and_does_not_ends_with_an_event(ends: Any, why: 
     assert ("end", why, sha256) in found and not loop.state.has_next
 
 
-def gone_back(loop: Loop, now_ns: int) -> list[Note]:
+def gone_back(loop: LoopDecisions, now_ns: int) -> list[Note]:
     loop.state.exchange, loop.state.incoming = "back", "a" * 64
     return loop.exchanged(now_ns, "d" * 64)
 
@@ -306,10 +306,10 @@ def test_a_result_that_comes_while_another_one_waits_decides_nothing() -> None:
 
 def test_a_warm_up_that_nothing_waits_for_does_not_end_the_diagnosis_under_way(tmp_path: Path) -> None:
     """A person has dismissed what was warmed up; it fails after the next diagnosis has begun."""
-    core = ModelLoop(settings(), parse_model(QUILL, source="test"), {})
+    core = ShadowedLoop(settings(), parse_model(QUILL, source="test"), {})
     core.state.diagnosis = under_way = Running(from_utc_ns=0, to_utc_ns=1, why="misfit")
     parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
-    loop = live.LiveLoop(settings(), parts, tmp_path, events=Mock(), journal=Mock(), clock=Mock())
+    loop = live.ServiceLoop(settings(), parts, tmp_path, events=Mock(), journal=Mock(), clock=Mock())
     dismissed = DiagnosisData(verdict="explained", candidate_sha256="c" * 64)
     wanted = Running(from_utc_ns=0, to_utc_ns=1, why="misfit")
     loop._warming = Found(wanted, Weighed(dismissed, b""), "", why="the candidate cannot be warmed up")
@@ -319,11 +319,11 @@ def test_a_warm_up_that_nothing_waits_for_does_not_end_the_diagnosis_under_way(t
 
 def test_the_result_of_a_diagnosis_that_has_ended_is_not_taken_for_that_of_the_next_one(tmp_path: Path) -> None:
     """A defect has ended the first one while its process ran on, and the next one has begun meanwhile."""
-    core = ModelLoop(settings(), parse_model(QUILL, source="test"), {})
+    core = ShadowedLoop(settings(), parse_model(QUILL, source="test"), {})
     core.state.diagnosis = under_way = Running(from_utc_ns=0, to_utc_ns=2, why="planned")
     parts = live.LoopParts(core=core, model=QUILL, store=Mock(), diagnose=Mock())
     events = Mock()
-    loop = live.LiveLoop(settings(), parts, tmp_path, events=events, journal=Mock(), clock=Mock())
+    loop = live.ServiceLoop(settings(), parts, tmp_path, events=events, journal=Mock(), clock=Mock())
     nothing = Weighed(DiagnosisData(verdict="adequate"), None)
     for to_utc_ns, taken in ((1, False), (2, True)):
         wanted = Running(from_utc_ns=0, to_utc_ns=to_utc_ns, why="planned")
@@ -396,14 +396,14 @@ async def test_a_disk_that_is_full_on_the_way_back_keeps_it_open(
     for one in machine(30):
         outcomes.append(present.process(one))
         before.process(one)
-    core = ModelLoop(config, present.model, {})
-    core.state.watched = Place(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
+    core = ShadowedLoop(config, present.model, {})
+    core.state.watched = InShadow(sha256=sha256_of(QUILL), effects=[], role="before", since_utc_ns=1)
     core.state.exchange, core.state.incoming = "back", sha256_of(QUILL)
     core.shadows[sha256_of(QUILL)] = Shadow(before, QUILL)
     store = ModelStore(tmp_path, QUILL, "vmc-07")
     store.adopt(extended(), name="extended", time_utc_ns=1, by_loop=True)
     events, files = Mock(), Mock()
-    loop = live.LiveLoop(
+    loop = live.ServiceLoop(
         config,
         live.LoopParts(core=core, model=extended(), store=store, diagnose=Mock()),
         tmp_path,

@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.comparison import compare
-from compensator.audit.series import Audit, audit
+from compensator.audit.machine_audit import Audit, audit
+from compensator.audit.other_model import compare
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.codes import ProbeCode

@@ -1,4 +1,4 @@
-"""Replays do what the service did: the recorded model, run free over the recordings, gives the recorded offsets."""
+"""Replays do what the service did: the recorded model, run as another one, gives the recorded offsets."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from compensator.audit.comparison import compare
+from compensator.audit.other_model import compare
 from compensator.config import parse_config
 from compensator.messages import number
 from compensator.model.model_file import parse_model
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.replay import FreeRun, apply, steps_of
+from compensator.service.replay import ForeignRun, apply, steps_of
 from tests.audit.made import CONFIG, QUILL
 from tests.service.living import MACHINE, Machine
 
@@ -30,11 +30,11 @@ def machine_with(folder: Path, happenings: Mapping[int, Callable[[Machine], Any]
     return machine
 
 
-def free_run_differs_um(machine: Machine) -> float:
+def foreign_run_differs_um(machine: Machine) -> float:
     """Run the recorded model over all recordings as another model would be; largest difference of an offset, µm."""
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
     assert found.samples == len(machine.outcomes) and not found.remarks
-    return abs(found.offsets.peak)
+    return abs(found.own.offsets.peak)
 
 
 @pytest.mark.parametrize("by_s", [3600.0, -3600.0, 86_400.0])
@@ -45,7 +45,7 @@ async def test_a_clock_that_was_set_is_no_pause(tmp_path: Path, by_s: float) -> 
     times = [outcome.sample.time_utc_ns for outcome in machine.outcomes]
     assert abs(times[61] - times[59]) > 3e12
     assert len(recordings(machine.recordings, MACHINE)) == (2 if by_s > 7200.0 else 1)
-    assert free_run_differs_um(machine) == 0.0
+    assert foreign_run_differs_um(machine) == 0.0
 
 
 @pytest.mark.parametrize("minutes", [7.0, 200.0])
@@ -54,7 +54,7 @@ async def test_between_two_starts_the_pause_is_the_recorded_one(tmp_path: Path, 
     await machine.run(80)
     await machine.sleep(minutes)
     await machine.run(60)
-    assert free_run_differs_um(machine) == 0.0
+    assert foreign_run_differs_um(machine) == 0.0
 
 
 async def test_a_pause_of_unknown_length_is_one_in_a_replay_too(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ async def test_a_pause_of_unknown_length_is_one_in_a_replay_too(tmp_path: Path) 
     machine.clock.set_wall_clock(-7200.0)
     await machine.run(60)
     assert machine.events("restart")[-1].data["missing"] is None
-    assert free_run_differs_um(machine) == 0.0
+    assert foreign_run_differs_um(machine) == 0.0
 
 
 async def test_a_torn_last_sample_counts_and_its_offset_does_not(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ async def test_a_torn_last_sample_counts_and_its_offset_does_not(tmp_path: Path)
     first = [step for step in steps_of(recordings(machine.recordings, MACHINE)[0]) if step.sample is not None]
     assert len(first) == 60 and "offset" not in first[-1].records
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
-    assert found.samples == 89 and found.offsets.peak == 0.0
+    assert found.samples == 89 and found.own.offsets.peak == 0.0
 
 
 async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ async def test_a_restart_goes_on_with_the_hold_of_an_internal_error(tmp_path: Pa
     after = [outcome.offset for outcome in machine.outcomes[-30:]]
     assert all("internal_error" in offset.reasons and number(offset.y_offset_um) == at_end for offset in after)
     assert not any("are not reproduced" in event.text for event in machine.events("restart"))
-    assert compare(recordings(machine.recordings, MACHINE), MODEL).offsets.peak == 0.0
+    assert compare(recordings(machine.recordings, MACHINE), MODEL).own.offsets.peak == 0.0
 
 
 async def test_where_files_between_were_not_given_their_time_is_the_pause(tmp_path: Path) -> None:
@@ -110,16 +110,16 @@ async def test_where_files_between_were_not_given_their_time_is_the_pause(tmp_pa
         await machine.run(40)
         await machine.sleep(2.0)
     first, _, last = recordings(machine.recordings, MACHINE)
-    free = FreeRun(Compensation(machine.config, MODEL))
+    foreign = ForeignRun(Compensation(machine.config, MODEL))
     by_hand = Compensation(machine.config, MODEL)
     for step in steps_of(first):
-        free.run(step)
+        foreign.run(step)
         apply(by_hand, step)
     before, samples = by_hand.status.time_utc_ns, [step for step in steps_of(last) if step.sample is not None]
     assert samples[0].sample is not None
     by_hand.pause(round((samples[0].sample.time_utc_ns - before) / 60e9) - 1)
     for step in samples:
-        outcome = free.run(step)
+        outcome = foreign.run(step)
         wanted = apply(by_hand, step)
         assert isinstance(outcome, Outcome) and isinstance(wanted, Outcome) and outcome.offset == wanted.offset
 
@@ -140,4 +140,4 @@ async def test_a_start_whose_first_sample_failed_keeps_its_pause(tmp_path: Path,
     await machine.run(120)
     assert not defects
     found = compare(recordings(machine.recordings, MACHINE), MODEL)
-    assert abs(found.offsets.peak) == 0.0 and machine.offsets()[-1] != machine.offsets()[64]
+    assert abs(found.own.offsets.peak) == 0.0 and machine.offsets()[-1] != machine.offsets()[64]

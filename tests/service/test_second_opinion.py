@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.clock import HOUR_NS
 from compensator.codes import ProbeCode
 from compensator.config import parse_config
@@ -23,9 +23,9 @@ from compensator.model.model_file import parse_model
 from compensator.recording.reading import messages, recordings
 from compensator.service.compensation import Compensation
 from compensator.service.probing.received import unused_probe
-from compensator.service.transfer.comparison import Comparison, ComparisonState, changed
-from compensator.service.transfer.evidence import evidence
+from compensator.service.transfer.refutation import evidence
 from compensator.service.transfer.second_opinion import described, second_opinion
+from compensator.service.transfer.two_models import Comparison, ComparisonState, changed
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.probed import PROBED, ProbedMachine

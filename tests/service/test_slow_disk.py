@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.audit.series import Audit, audit, summary
+from compensator.audit.machine_audit import Audit, audit, summary
 from compensator.messages import Event, Offset
 from compensator.recording.reading import read_messages, recordings
 from compensator.service import disk_writer

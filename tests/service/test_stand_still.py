@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.clock import NS, SystemClock, VirtualClock
 from compensator.config import parse_config
 from compensator.events import PauseData, data_of

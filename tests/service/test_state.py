@@ -16,7 +16,7 @@ from compensator.messages import SEQ_MAX, encode
 from compensator.model.effects import kinds
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.state import LARGEST_COVARIANCE, decode_state, encode_state
+from compensator.service.state import LARGEST_COVARIANCE, decode_state, frozen_state
 from tests.service.records import EFFECTS, QUILL, day, direct, late, with_effects, with_method
 from tests.service.simulated import TABLE, config
 
@@ -125,7 +125,7 @@ def test_every_number_comes_back_to_the_bit(
     state = decode_state(Compensation(CONFIG, QUILL).state())
     state.guards["y_um"] = guard
     state.zero.y_ref, state.memory.missing_min = y_ref, missing
-    again = decode_state(encode_state(state))
+    again = decode_state(frozen_state(state)())
     before = [*guard, y_ref, missing]
     after = [*again.guards["y_um"], again.zero.y_ref, again.memory.missing_min]
     assert [v.hex() for v in after] == [v.hex() for v in before]  # hex tells -0.0 and NaN

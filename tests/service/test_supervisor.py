@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.audit.series import audit, summary
+from compensator.audit.machine_audit import audit, summary
 from compensator.config import parse_config
 from compensator.messages import Offset, Sample
 from compensator.recording.reading import decode, read_messages, recordings

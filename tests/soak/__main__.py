@@ -7,7 +7,7 @@ import logging
 import tempfile
 from pathlib import Path
 
-from compensator.audit.series import summary
+from compensator.audit.machine_audit import summary
 from compensator.commands.stopping import stoppable
 from tests.fuzz import test_sensor_faults as sensor_faults
 from tests.soak import forgeries, hostile, kills, month

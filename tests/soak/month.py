@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from compensator.audit.series import Audit, audit
+from compensator.audit.machine_audit import Audit, audit
 from compensator.clock import NS, VirtualClock
 from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset, Sample, number

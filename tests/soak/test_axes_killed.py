@@ -6,7 +6,7 @@ import itertools
 import time
 from pathlib import Path
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.receiver import AppliedAxes, AxesReceiver, AxesSettings, ControlState, load_any
 from compensator.recording.reading import recordings
 from tests.receiver.wire import free_port, router, until

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from compensator.audit.series import audit
+from compensator.audit.machine_audit import audit
 from compensator.config import load_config
 from compensator.messages import ProbeRequest, shipped_schema
 from compensator.recording.reading import messages, recordings

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from compensator.audit.series import summary
+from compensator.audit.machine_audit import summary
 from tests.soak import kills, month
 
 

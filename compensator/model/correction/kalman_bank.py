@@ -225,7 +225,7 @@ class KalmanBank:
 
     # ------------------------------------------------------------------ what is known
 
-    def mixture(self, n: int, *, zeroed: bool = False) -> Mixture:
+    def mixture(self, n: int, *, zeroed: bool) -> Mixture:
         """Return what is known of the first `n` states.
 
         Parameters

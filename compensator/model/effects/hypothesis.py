@@ -23,7 +23,7 @@ from compensator.model.effects.signals import RecordSignals
 #: Lags in a filter bank, and the longest of them, min.
 BANK, BANK_LONGEST_MIN = 6, 600.0
 #: Where a machine may be at rest: at the coolest start of all records, or where T_Q is AT.
-RESTS = COOLEST, EQUAL = "coolest start", "T_Q = AT"
+COOLEST, EQUAL = "coolest start", "T_Q = AT"
 #: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
 DEGC = "_degc"
 
@@ -91,7 +91,7 @@ class Hypothesis:
     ordered : bool
         Whether the searched parameters are interchangeable, so that only ascending ones are tried.
     rest : str
-        Where the machine is at rest, of the `RESTS`, for an effect that counts from there.
+        Where the machine is at rest, `COOLEST` or `EQUAL`, for an effect that counts from there.
     """
 
     effect: Effect
@@ -249,10 +249,10 @@ class Context:
         tau = self.tau("surface_min")
         return dataclasses.replace(tau, grid=tau.grid[2::3], key="")
 
-    def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
+    def tau(self, name: str = "tau_min") -> Free:
         """Return a time constant, from a sample to a third of the record."""
         high = max(self.minutes / 3.0, 10.0 * self.period_min)
-        low = low * self.period_min
+        low = 0.6 * self.period_min
         grid = tuple(float(t) for t in np.geomspace(low, high, 12))
         return Free(name=name, low=low, high=high, grid=grid, key="tau_min")
 

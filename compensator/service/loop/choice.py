@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from compensator.clock import HOUR_NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.place import is_asked, leads
 from compensator.service.loop.proof import is_clearly_better
-from compensator.service.loop.state import LoopState, Place, is_fewer, same_effects
+from compensator.service.loop.state import InShadow, LoopState, is_fewer, same_effects
 
 
 class Choice:
@@ -27,24 +27,24 @@ class Choice:
     ----------
     state : LoopState
         State of the loop.
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     compared : callable
         Returns what is compared of a model in shadow and the present one.
     """
 
-    def __init__(self, state: LoopState, settings: LoopSettings, compared: Callable[[Place], Compared]) -> None:
+    def __init__(self, state: LoopState, settings: LoopSettings, compared: Callable[[InShadow], Compared]) -> None:
         self._state, self._settings, self._compared = state, settings, compared
         self._beside: dict[tuple[str, str], ComparisonData] = {}
 
-    def beside(self, place: Place, rival: Place) -> ComparisonData:
+    def beside(self, place: InShadow, rival: InShadow) -> ComparisonData:
         """Compare a candidate with another one."""
         pair = place.sha256, rival.sha256
         if pair not in self._beside:
             self._beside[pair] = self._compared(place).beside(rival)
         return self._beside[pair]
 
-    def better(self, judged: Sequence[Place], now_ns: int) -> list[Place]:
+    def better(self, judged: Sequence[InShadow], now_ns: int) -> list[InShadow]:
         """Return the candidates to choose from, the best first: what is proposed with a new verdict only."""
         asked = self._state.proposed
         if asked is not None and is_asked(asked, self._settings):
@@ -57,7 +57,7 @@ class Choice:
             and self._compared(place).is_better(now_ns)
         ]
 
-    def adopted(self, better: Sequence[Place], now_ns: int) -> Place | None:
+    def adopted(self, better: Sequence[InShadow], now_ns: int) -> InShadow | None:
         """Return the one that is adopted without a person."""
         if not self._may_adopt(now_ns):
             return None
@@ -67,7 +67,7 @@ class Choice:
                 return place
         return None
 
-    def proposed(self, better: Sequence[Place]) -> Place | None:
+    def proposed(self, better: Sequence[InShadow]) -> InShadow | None:
         """Return the one that a person is asked about, in the place of a proposed one that it surpasses.
 
         Under `adopt` nobody is asked for a zero because of newer parameters: they are adopted once they are better
@@ -83,7 +83,7 @@ class Choice:
                 return place
         return None
 
-    def gone_back_to(self, judged: Sequence[Place]) -> Place | None:
+    def gone_back_to(self, judged: Sequence[InShadow]) -> InShadow | None:
         """Return the model that the service goes back to; while a newcomer waits only the one before may be it."""
         state = self._state
         ways = [
@@ -109,13 +109,13 @@ class Choice:
             return False
         return not any(leads(place.verdict, self._settings) for place in state.ways_back)
 
-    def _surpassing(self, place: Place) -> Iterator[Place]:
+    def _surpassing(self, place: InShadow) -> Iterator[InShadow]:
         others = (*self._state.candidates, *self._state.ways_back)
         return (one for one in others if one is not place and self._surpasses(one, place))
 
-    def _surpasses(self, place: Place, rival: Place) -> bool:
+    def _surpasses(self, place: InShadow, rival: InShadow) -> bool:
         return is_clearly_better(self.beside(place, rival))
 
-    def _has_more_and_waits(self, one: Place, place: Place) -> bool:
+    def _has_more_and_waits(self, one: InShadow, place: InShadow) -> bool:
         """Return whether a candidate has all effects of another one and more, and cannot be adopted yet."""
         return is_fewer(place.effects, of=one.effects) and self._compared(one).level_um is None

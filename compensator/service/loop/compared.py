@@ -10,7 +10,7 @@ import numpy as np
 from compensator.arrays import rms_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.diagnose.change import QUIET
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
@@ -27,12 +27,12 @@ from compensator.service.loop.proof import (
     is_enough,
     shared,
 )
-from compensator.service.loop.state import NO_VERDICT, Place
+from compensator.service.loop.state import NO_VERDICT, InShadow
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero
 from compensator.service.transfer.beside import beside
-from compensator.service.transfer.comparison import FEWEST, Comparison, changed
 from compensator.service.transfer.second_opinion import is_unusable
+from compensator.service.transfer.two_models import FEWEST_CHANGES, Comparison, changed
 
 
 class Compared:
@@ -40,9 +40,9 @@ class Compared:
 
     Parameters
     ----------
-    place : Place
+    place : InShadow
         The place; its comparison and verdict are kept up to date.
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     period_s : float
         Length of a sample, s.
@@ -60,7 +60,7 @@ class Compared:
 
     def __init__(
         self,
-        place: Place,
+        place: InShadow,
         settings: LoopSettings,
         period_s: float,
         present_error: ErrorBlocks,
@@ -178,13 +178,13 @@ class Compared:
         residuals_um = self._comparison.residuals_um
         own_um = rms_of(np.array(residuals_um).T[1])
         before = [mean for block, mean in self._present_error.blocks if block < residuals_um[0][0]]
-        return len(before) < FEWEST or sum(abs(mean) < QUIET * own_um for mean in before) >= FEWEST
+        return len(before) < FEWEST_CHANGES or sum(abs(mean) < QUIET * own_um for mean in before) >= FEWEST_CHANGES
 
     @property
     def _is_alone_near_zero(self) -> bool:
         """Whether only the other model is right about the zero, and its changes are no worse."""
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
-        if len(residuals_um) < FEWEST or (found.deviations is not None and found.deviations < 0.0):
+        if len(residuals_um) < FEWEST_CHANGES or (found.deviations is not None and found.deviations < 0.0):
             return False
         own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
         return 0.0 < other_um <= ALONE_PART * own_um
@@ -209,7 +209,7 @@ class Compared:
         since_ns = self._place.level_utc_ns or self._place.since_utc_ns
         return level_um(self._present_error.blocks, self._place.error.blocks, since_ns=since_ns)
 
-    def go_on_with(self, before: Place, now_ns: int) -> None:
+    def go_on_with(self, before: InShadow, now_ns: int) -> None:
         """Take over what a candidate with the same effects has shown.
 
         Also of its level: hours that it did not know have shown it, and if the errors of this one stay in them, too,
@@ -225,12 +225,12 @@ class Compared:
             place.level_utc_ns = 0
         place.error.go_on_after(before.error)
 
-    def beside(self, rival: Place) -> ComparisonData:
+    def beside(self, rival: InShadow) -> ComparisonData:
         """Compare the model with another one in shadow, as if that were the present one, on the hours of both."""
         state = beside(rival.comparison, self._place.comparison)
         return Comparison(self._period_s, state).verdict(deviations=self._settings.deviations)
 
-    def go_on_beside(self, present: Place, level_um: float) -> None:
+    def go_on_beside(self, present: InShadow, level_um: float) -> None:
         """Go on after another model in shadow, raised by so much, has become the present one: the hours of both count.
 
         Nothing is proposed any longer.

@@ -16,8 +16,8 @@ from compensator.messages import SCHEMA, Candidate
 from compensator.model.effects.names import effect_names
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.loop.loop import Loop
 from compensator.service.loop.state import LoopState, Role, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, weigh, without_candidate
 from compensator.service.status import Handover
@@ -33,8 +33,8 @@ def shadow_files(state: LoopState) -> dict[str, tuple[str, str]]:
 
     Examples
     --------
-    >>> from compensator.service.loop.state import Place
-    >>> places = [Place(sha256=sha, effects=[], role="candidate", since_utc_ns=1) for sha in "ab"]
+    >>> from compensator.service.loop.state import InShadow
+    >>> places = [InShadow(sha256=sha, effects=[], role="candidate", since_utc_ns=1) for sha in "ab"]
     >>> list(shadow_files(LoopState(found=places)).values())
     [('candidate.toml', 'candidate_state.json'), ('candidate_2.toml', 'candidate_2_state.json')]
     """
@@ -52,7 +52,7 @@ class Followed(msgspec.Struct, frozen=True):
     notes: tuple[Note, ...]
 
 
-class ModelLoop:
+class ShadowedLoop:
     """The loop of one machine, with the compensations of the models in shadow.
 
     Parameters
@@ -78,7 +78,7 @@ class ModelLoop:
         self.present = present
         data = attachments.get(LOOP_STATE)
         state = decode_loop(data) if data is not None else None
-        self.loop = Loop(config.loop, present.period_s, effect_names(present.effects), state)
+        self.loop = LoopDecisions(config.loop, present.period_s, effect_names(present.effects), state)
         #: The models in shadow, by hash; one without a place has ended, and goes before the next sample.
         self.shadows: dict[str, Shadow] = {}
         for sha256, files in shadow_files(self.state).items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from compensator.events import ComparisonData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.place import role_of
-from compensator.service.loop.state import LoopState, Place
+from compensator.service.loop.state import InShadow, LoopState
 from compensator.service.loop.words import does_not_begin, ended, named
 
 #: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
@@ -13,7 +13,7 @@ FAILED_OUTSIDE = "failed"
 
 def note_of(
     state: LoopState,
-    place: Place,
+    place: InShadow,
     step: LoopAction,
     text: str,
     *,
@@ -35,7 +35,7 @@ def note_of(
 
 
 def withdraw(
-    state: LoopState, place: Place, text: str, *, why: str = "", comparison: ComparisonData | None = None
+    state: LoopState, place: InShadow, text: str, *, why: str = "", comparison: ComparisonData | None = None
 ) -> list[Note]:
     """Withdraw a proposal; its candidate goes on."""
     place.is_proposed = False
@@ -43,7 +43,7 @@ def withdraw(
     return [note_of(state, place, LoopAction.WITHDRAW, text, why=why, comparison=comparison)]
 
 
-def end(state: LoopState, place: Place, why: str, text: str = "") -> list[Note]:
+def end(state: LoopState, place: InShadow, why: str, text: str = "") -> list[Note]:
     """End a shadow, and an exchange with it."""
     text = text or f"the model with {named(place.effects)} is compared no longer: {ended(why, place.verdict)}"
     notes = [note_of(state, place, LoopAction.END, text, why=why)]

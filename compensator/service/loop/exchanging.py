@@ -6,18 +6,18 @@ from collections.abc import Callable
 
 import msgspec
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import Note
 from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.compared import Compared
 from compensator.service.loop.ending import end, end_diagnosis, withdraw
 from compensator.service.loop.place import gives_way, role_beside
 from compensator.service.loop.proof import CANDIDATES
-from compensator.service.loop.state import Exchange, LoopState, Place, same_effects
+from compensator.service.loop.state import Exchange, InShadow, LoopState, same_effects
 
 
 def decide_exchange(
-    state: LoopState, action: Exchange, place: Place, compared: Callable[[Place], Compared]
+    state: LoopState, action: Exchange, place: InShadow, compared: Callable[[InShadow], Compared]
 ) -> list[Note]:
     """Decide an exchange, and the level of the other model."""
     found, proposed = compared(place), state.proposed
@@ -36,7 +36,7 @@ def exchanged(
     settings: LoopSettings,
     now_ns: int,
     sha256_before: str,
-    compared: Callable[[Place], Compared],
+    compared: Callable[[InShadow], Compared],
 ) -> list[Note]:
     """Go on after a model in shadow has replaced the present one, whose hash was `sha256_before`.
 
@@ -71,7 +71,7 @@ def exchanged(
         return notes + _make_room(state, settings, now_ns)
     notes += _make_room(state, settings, now_ns)
     state.adopted_utc_ns = now_ns
-    outgoing = Place(sha256=sha256_before, effects=before, role="before", since_utc_ns=now_ns)
+    outgoing = InShadow(sha256=sha256_before, effects=before, role="before", since_utc_ns=now_ns)
     watched = state.watched
     if watched is not None and same_effects(before, incoming.effects):
         # Other parameters of the same effects end with the same effect: it stays the way back.

@@ -11,7 +11,7 @@ from compensator.clock import NS, Clock
 from compensator.config import Config
 from compensator.errors import CompensatorError
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.process import Diagnose
 from compensator.service.loop.state import Running
@@ -88,7 +88,7 @@ class Found:
         return compensation, errors
 
 
-async def diagnosed(core: ModelLoop, present: bytes, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:
+async def diagnosed(core: ShadowedLoop, present: bytes, diagnose: Diagnose, store: ModelStore, clock: Clock) -> Found:
     """Make the diagnosis that the loop wants; what goes wrong is a diagnosis that failed.
 
     `present` is the file of the present model: it may be wanted without one of its effects.

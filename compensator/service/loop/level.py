@@ -17,13 +17,13 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import rms_of
-from compensator.diagnose.change import BLOCK_MIN, FEWEST, QUIET, changed_at
+from compensator.diagnose.change import BLOCK_MIN, FEWEST_BLOCKS, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero, sets_zero_at_rest
-from compensator.service.transfer.comparison import BLOCK_NS
-from compensator.service.transfer.evidence import FLOOR_UM
+from compensator.service.transfer.refutation import FLOOR_UM
 from compensator.service.transfer.second_opinion import is_unusable
+from compensator.service.transfer.two_models import BLOCK_NS
 
 #: The present model was right before if it erred by less than `QUIET` of what it errs by since then, and its error
 #: changed by less than this part of what the candidate's changed by.
@@ -140,14 +140,14 @@ def level_um(
     others = dict(other)
     numbers = np.array([n for n, _ in present if n in others])
     own, rest = np.array([(mean, others[n]) for n, mean in present if n in others]).reshape(-1, 2).T
-    if numbers.size < 2 * FEWEST:
+    if numbers.size < 2 * FEWEST_BLOCKS:
         return None
     at_s = changed_at(60.0 * BLOCK_MIN * numbers, own, FLOOR_UM)
     if at_s is None:
         return None
     since = numbers >= round(at_s / (60.0 * BLOCK_MIN))
     compared = since & (numbers * BLOCK_NS >= since_ns)
-    if np.sum(compared) < FEWEST:
+    if np.sum(compared) < FEWEST_BLOCKS:
         return None
     left_um, error_um = rest[compared], rms_of(own[compared])
     was_right = rms_of(own[~since]) < QUIET * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])

@@ -22,7 +22,7 @@ from compensator.model.effects.names import effect_names
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
-from compensator.service.loop.core import Followed, ModelLoop
+from compensator.service.loop.core import Followed, ShadowedLoop
 from compensator.service.loop.ending import FAILED_OUTSIDE
 from compensator.service.loop.found import Found, diagnosed
 from compensator.service.loop.place import role_of
@@ -30,9 +30,9 @@ from compensator.service.loop.process import Diagnose
 from compensator.service.loop.status import loop_status
 from compensator.service.loop.storing import Storing, calibrated_effects
 from compensator.service.loop.words import named
-from compensator.service.transfer.comparison import changed
 from compensator.service.transfer.model_store import ModelStore
 from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.two_models import changed
 
 log = logging.getLogger("compensator")
 
@@ -54,7 +54,7 @@ class LoopParts:
 
     Parameters
     ----------
-    core : ModelLoop
+    core : ShadowedLoop
         In its state after the last sample.
     model : bytes
         File of the present model.
@@ -64,14 +64,14 @@ class LoopParts:
         Makes a diagnosis.
     """
 
-    core: ModelLoop
+    core: ShadowedLoop
     model: bytes
     store: ModelStore
     diagnose: Diagnose
 
 
-class LiveLoop:
-    """The loop of the running service; used in the service's loop only.
+class ServiceLoop:
+    """The loop of the running service; used in the service's event loop only.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class LiveLoop:
         self._diagnose = parts.diagnose
         self._events, self._journal, self._clock = events, journal, clock
         #: None after an internal error of the loop: it stays off until the next start.
-        self._core: ModelLoop | None = parts.core
+        self._core: ShadowedLoop | None = parts.core
         self._candidates: tuple[Candidate, ...] = ()
         #: The diagnosis or warm-up in progress, and what it gave.
         self._task: asyncio.Task[None] | None = None
@@ -132,7 +132,7 @@ class LiveLoop:
 
     def opening(self) -> Mapping[str, bytes]:
         """Return what a recording that starts with the next sample begins with."""
-        return self._guarded(ModelLoop.attachments, {}, again=ModelLoop.attachments)
+        return self._guarded(ShadowedLoop.attachments, {}, again=ShadowedLoop.attachments)
 
     # ------------------------------------------------------------------ between two samples
 
@@ -140,7 +140,7 @@ class LiveLoop:
         """Return the compensation for the next sample, after an exchange if one is due."""
         in_force = [present]
 
-        def again(core: ModelLoop) -> None:
+        def again(core: ShadowedLoop) -> None:
             core.drop_ended()
             self._journal.start_new_file()
 
@@ -148,7 +148,7 @@ class LiveLoop:
         self._guarded(lambda core: self._change(core, in_force), None, again=again)
         return in_force[-1]
 
-    def _change(self, core: ModelLoop, in_force: list[Compensation]) -> None:
+    def _change(self, core: ShadowedLoop, in_force: list[Compensation]) -> None:
         """Let what has ended go, what is warmed up begin, and an exchange happen, which adds what is in force then."""
         present = in_force[-1]
         if core.drop_ended():
@@ -165,7 +165,7 @@ class LiveLoop:
         self._journal.start_new_file(self._model)
         self._note(notes)
 
-    def _begin_shadow(self, core: ModelLoop, warmed: Found) -> None:
+    def _begin_shadow(self, core: ShadowedLoop, warmed: Found) -> None:
         ready = warmed.catch_up()
         if ready is None:
             return
@@ -180,7 +180,7 @@ class LiveLoop:
         """Hand over what has reached the loop since the last sample; the events are recorded with the next one."""
         self._guarded(lambda core: self._hand_over(core, present.status.time_utc_ns), None)
 
-    def _hand_over(self, core: ModelLoop, now_ns: int) -> None:
+    def _hand_over(self, core: ShadowedLoop, now_ns: int) -> None:
         if core.state.exchange != "back":
             self._back_waits_for = ""
         found, self._found = self._found, None
@@ -196,7 +196,7 @@ class LiveLoop:
         if self._storing.refused:
             self._end_not_stored(core)
 
-    def _weigh(self, core: ModelLoop, warming: Found) -> None:
+    def _weigh(self, core: ShadowedLoop, warming: Found) -> None:
         """Let the loop decide about what is warmed up, if it still waits for that."""
         running = core.state.diagnosis
         if running is None or running.candidate_sha256 != warming.weighed.data.candidate_sha256:
@@ -212,7 +212,7 @@ class LiveLoop:
 
     def resume(self) -> None:
         """Pass on an operator's `resume`."""
-        self._guarded(ModelLoop.resume, None)
+        self._guarded(ShadowedLoop.resume, None)
 
     def dismiss(self, present: Compensation, sha256: str) -> None:
         """End a candidate: an operator's command that acts with the next sample.
@@ -252,7 +252,7 @@ class LiveLoop:
             If there is no such candidate, or it is not proposed and `unproposed` is given.
         """
 
-        def offered(core: ModelLoop) -> Offer | None:
+        def offered(core: ShadowedLoop) -> Offer | None:
             if core.state.exchange:
                 return None
             candidate = core.loop.meant(sha256)
@@ -271,7 +271,7 @@ class LiveLoop:
         """Begin anew after an operator has changed the model."""
         self._model = model
 
-        def begin_anew(core: ModelLoop) -> None:
+        def begin_anew(core: ShadowedLoop) -> None:
             self._cancel()
             core.present = present.model
             effects, now_ns = effect_names(present.model.effects), present.status.time_utc_ns
@@ -290,7 +290,7 @@ class LiveLoop:
     def process(self, outcome: Outcome) -> tuple[Candidate, ...]:
         """Process a sample after the present compensation; return the records of the models in shadow."""
 
-        def alone(core: ModelLoop) -> Followed:
+        def alone(core: ShadowedLoop) -> Followed:
             return Followed((), tuple(core.loop.step(outcome, {})))
 
         # The shadow is no part of what is published: its defect must neither hold the offset nor stop the service.
@@ -302,7 +302,7 @@ class LiveLoop:
         return followed.candidates
 
     def _guarded(
-        self, act: Callable[[ModelLoop], T], otherwise: T, *, again: Callable[[ModelLoop], T] | None = None
+        self, act: Callable[[ShadowedLoop], T], otherwise: T, *, again: Callable[[ShadowedLoop], T] | None = None
     ) -> T:
         """Do something with the loop; a defect ends the shadow, or the loop if that fails too, and never a sample.
 
@@ -350,7 +350,7 @@ class LiveLoop:
             storing.begin_again(self._model, model_of(self._config, self._model, source="present model").name)
         self._guarded(self._begin_decided, None)
 
-    def _begin_decided(self, core: ModelLoop) -> None:
+    def _begin_decided(self, core: ShadowedLoop) -> None:
         """Begin a diagnosis that is wanted, and to store the model of a decided exchange."""
         if core.loop.wanted is not None and self._task is None and self._found is None:
             self._task = asyncio.create_task(self._make_diagnosis(core))
@@ -372,7 +372,7 @@ class LiveLoop:
 
     # ------------------------------------------------------------------ tasks
 
-    async def _make_diagnosis(self, core: ModelLoop) -> None:
+    async def _make_diagnosis(self, core: ShadowedLoop) -> None:
         self._found = await diagnosed(core, self._model, self._diagnose, self._store, self._clock)
         self._task = None
 
@@ -387,19 +387,19 @@ class LiveLoop:
         self._storing.cancel()
         self._back_waits_for = ""
 
-    def _give_up(self, core: ModelLoop, why: str) -> None:
+    def _give_up(self, core: ShadowedLoop, why: str) -> None:
         """End everything in shadow."""
         self._warming = None
         ended = core.loop.give_up(FAILED_OUTSIDE, why)
         self._note(ended or [_failed(why)])
 
-    def _end_one(self, core: ModelLoop, sha256: str, why: str) -> None:
+    def _end_one(self, core: ShadowedLoop, sha256: str, why: str) -> None:
         """End a candidate: that in shadow, or one whose warm-up has failed."""
         self._warming = None
-        ended = core.loop.give_up_one(sha256, FAILED_OUTSIDE, why)
+        ended = core.loop.give_up_one(sha256, why)
         self._note(ended or [_failed(why)])
 
-    def _end_not_stored(self, core: ModelLoop) -> None:
+    def _end_not_stored(self, core: ShadowedLoop) -> None:
         why, self._storing.refused = self._storing.refused, ""
         incoming = core.incoming
         if incoming is None or core.state.exchange == "back":

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from compensator.clock import HOUR_NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, DiagnosisData
 from compensator.service.loop.avoided import is_avoided
 from compensator.service.loop.proof import BETTER_PART, CANDIDATES
-from compensator.service.loop.state import LoopState, Place, Role, is_fewer, same_effects
+from compensator.service.loop.state import InShadow, LoopState, Role, is_fewer, same_effects
 
 #: A model is better so far if it has shown this part of the deviations that it must show.
 LEADS = 0.5
@@ -41,7 +41,7 @@ def role_of(found: DiagnosisData) -> Role:
     return "before" if found.calibrated or found.fewer else "candidate"
 
 
-def role_beside(place: Place, effects: Sequence[str], settings: LoopSettings) -> Role:
+def role_beside(place: InShadow, effects: Sequence[str], settings: LoopSettings) -> Role:
     """Return the role of a model in shadow beside a present one with other effects."""
     if not is_fewer(place.effects, effects):
         return "candidate"
@@ -72,23 +72,23 @@ def why_nothing(state: LoopState, settings: LoopSettings, found: DiagnosisData, 
     return "waits" if state.exchange else ""
 
 
-def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> Place | None:
+def with_effects(state: LoopState, role: Role, effects: Sequence[str]) -> InShadow | None:
     """Return what was found with the effects and the role of another model, which then goes on with its comparison."""
     alike = [place for place in state.found if place.role == role and same_effects(place.effects, effects)]
     return alike[0] if alike and not state.exchange else None
 
 
-def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | None:
+def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> InShadow | None:
     """Return the candidate that gives its place to another one with other effects; None if a place is free.
 
-    It is the one with the least log likelihood ratio for each hour of evidence (`Place.promise`), of those that have
+    It is the one with the least log likelihood ratio for each hour of evidence (`InShadow.promise`), of those that have
     been judged for `shadow_h`, where it is noise before, or have had the time for that: what is never compared keeps no
     place. Only where none has, of all. What is proposed stays.
     """
     if len(state.candidates) < CANDIDATES:
         return None
 
-    def is_new(place: Place) -> bool:
+    def is_new(place: InShadow) -> bool:
         has_time = now_ns - place.since_utc_ns >= _HAS_TIME * settings.shadow_h * HOUR_NS
         return place.verdict.hours < settings.shadow_h and not has_time
 
@@ -97,7 +97,7 @@ def gives_way(state: LoopState, settings: LoopSettings, now_ns: int) -> Place | 
     )
 
 
-def is_asked(candidate: Place, settings: LoopSettings) -> bool:
+def is_asked(candidate: InShadow, settings: LoopSettings) -> bool:
     """Return whether a person reads the proposal of a candidate.
 
     It must still be there at the answer: whatever is newer comes after it.

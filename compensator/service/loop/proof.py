@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.events import ComparisonData, ComparisonVerdict
 
 #: A candidate must be wrong by less than this part of what the present model is wrong by.
@@ -56,7 +56,7 @@ def is_clearly_better(found: ComparisonData) -> bool:
     return found.verdict == ComparisonVerdict.BETTER and found.ratio is not None and found.ratio <= BETTER_PART
 
 
-def is_better_about_zero(found: ComparisonData, part: float = BETTER_PART) -> bool:
+def is_better_about_zero(found: ComparisonData, part: float) -> bool:
     """Return whether the candidate is better about the zero, too: its level does not contradict measured Y."""
     if found.present_rms_um is None or found.candidate_rms_um is None:
         return False

@@ -32,7 +32,7 @@ _ALIVE = ("t_q_degc", "at_degc", "y_um")
 BEFORE_H = 1.0
 
 
-def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
+def usable_table(record: Sequence[Outcome]) -> Table:
     """Return outcomes as the table of a diagnosis; the time counts from 1970.
 
     Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own: as much later
@@ -41,7 +41,7 @@ def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
     return table_of_rows(
         [(outcome.sample, outcome.offset) for outcome in record],
         [probe for outcome in record for probe in outcome.probes],
-        name,
+        "record",
         zeros_ns=[outcome.sample.time_utc_ns for outcome in record if sets_zero(outcome)],
     )
 

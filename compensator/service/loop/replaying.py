@@ -9,7 +9,7 @@ from compensator.events import CommandName, DiagnosisData, EventKind, LoopAction
 from compensator.messages import Event
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Contents
-from compensator.service.loop.core import LOOP_STATE, ModelLoop
+from compensator.service.loop.core import LOOP_STATE, ShadowedLoop
 from compensator.service.loop.ending import FAILED_OUTSIDE
 from compensator.service.replay import RecordedStep, setup_of
 
@@ -27,7 +27,7 @@ _DECIDED = (
 )
 
 
-def hand_over_all(core: ModelLoop, step: RecordedStep, now_ns: int) -> list[Note]:
+def hand_over_all(core: ShadowedLoop, step: RecordedStep, now_ns: int) -> list[Note]:
     """Hand over what reached the loop before the sample of a group; return the decisions that followed.
 
     `now_ns` is the time of the last sample, ns since 1970 UTC.
@@ -37,7 +37,7 @@ def hand_over_all(core: ModelLoop, step: RecordedStep, now_ns: int) -> list[Note
     return [note for event in step.events if event.seq == seq for note in hand_over(core, event, now_ns)]
 
 
-def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
+def hand_over(core: ShadowedLoop, event: Event, now_ns: int) -> list[Note]:
     """Hand a recorded event over to the loop, if it came from outside; return the decisions that followed."""
     if event.kind == EventKind.COMMAND:
         name = command_of(event)
@@ -58,7 +58,7 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
             # When a warm-up ends is an input, as a diagnosis is: what follows from it has not begun yet.
             return core.loop.begin()
         if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
-            core.loop.give_up_one(data.model_sha256, FAILED_OUTSIDE, event.text)
+            core.loop.give_up_one(data.model_sha256, event.text)
     return []
 
 
@@ -68,7 +68,7 @@ def _meant(event: Event) -> str:
     return sha256 if isinstance(sha256, str) else ""
 
 
-def recorded_loop(contents: Contents, present: ThermalModel, file: str) -> ModelLoop | None:
+def recorded_loop(contents: Contents, present: ThermalModel, file: str) -> ShadowedLoop | None:
     """Return the loop of a recording in its state at the start of the file; None if it has none.
 
     Raises
@@ -81,7 +81,7 @@ def recorded_loop(contents: Contents, present: ThermalModel, file: str) -> Model
         return None
     try:
         config, _ = setup_of(contents, file)
-        return ModelLoop(config, present, found)
+        return ShadowedLoop(config, present, found)
     except CompensatorError as error:
         raise DataError(f"{file}: {error}") from error
 

@@ -21,7 +21,7 @@ from compensator.recording.container import Container
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.loop.core import LOOP_STATE, ModelLoop
+from compensator.service.loop.core import LOOP_STATE, ShadowedLoop
 from compensator.service.loop.replaying import hand_over_all, recorded_loop
 from compensator.service.loop.storing import calibrated_effects
 from compensator.service.replay import apply, opening_of, setup_of, steps_in
@@ -36,7 +36,7 @@ log = logging.getLogger("compensator")
 class _Replayed:
     """The last recording with a loop, at its end."""
 
-    core: ModelLoop
+    core: ShadowedLoop
     compensation: Compensation
     config: bytes
     model: bytes
@@ -44,7 +44,7 @@ class _Replayed:
     is_last: bool
 
 
-def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ModelLoop | None:
+def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ShadowedLoop | None:
     """Return the loop in its state at the end of the last recording, None without `[loop]`.
 
     After an interrupted exchange `resumed` gets the compensation that continues from the one before; events are added
@@ -56,7 +56,7 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mo
     return _continued(loaded, resumed, store)
 
 
-def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ModelLoop:
+def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> ShadowedLoop:
     config, present = loaded.config, resumed.compensation
     calibrated = calibrated_effects(config, store, effect_names(present.model.effects))
     try:
@@ -70,7 +70,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mod
         resumed.note(f"the loop starts again without its state: internal error: {type(error).__name__}: {error}")
         last = None
     if last is None:
-        core = ModelLoop(config, present.model, {})
+        core = ShadowedLoop(config, present.model, {})
         core.state.base_effects = list(calibrated)
         return core
     core = last.core
@@ -92,7 +92,7 @@ def _continued(loaded: LoadedConfig, resumed: Resumed, store: ModelStore) -> Mod
     back = last.compensation.model.sha256 != present.model.sha256 and _is_gone_back_to(store, present)
     resumed.notes += core.loop.model_changed(effects, now_ns, calibrated=calibrated, back=back)
     core.drop_ended()
-    return ModelLoop(config, present.model, core.attachments())
+    return ShadowedLoop(config, present.model, core.attachments())
 
 
 def _is_gone_back_to(store: ModelStore, present: Compensation) -> bool:

@@ -19,7 +19,7 @@ from compensator.messages import UNREADABLE, Candidate, Sample
 from compensator.model.effects.names import effect_names
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.place import role_of
 from compensator.service.loop.weighing import Diagnosed, failed, without_effect
@@ -29,7 +29,7 @@ from compensator.service.status import Zero
 from compensator.service.transfer.shadow import Shadow
 from compensator.service.transfer.warm_up import WARM_UP
 
-__all__ = ["Diagnosed", "LoopRun", "LoopStep"]
+__all__ = ["Diagnosed", "LoopStep", "OfflineLoop"]
 
 
 class LoopStep(msgspec.Struct, frozen=True):
@@ -66,7 +66,7 @@ class _Saved(msgspec.Struct, kw_only=True):
     warm_utc_ns: int = 0
 
 
-class LoopRun:
+class OfflineLoop:
     """Runs the service and the loop of one machine.
 
     Parameters
@@ -91,7 +91,7 @@ class LoopRun:
         self._diagnose = diagnose
         self._calibrated = self._data = model
         self._compensation = Compensation(config, model_of(config, model, source="model"))
-        self._core = ModelLoop(config, self._compensation.model, {})
+        self._core = ShadowedLoop(config, self._compensation.model, {})
         self._record: deque[Outcome] = deque()
         #: Pauses within the record, in samples, by the number of the sample before; see `pause`.
         self._pauses: dict[int, int | None] = {}
@@ -111,11 +111,6 @@ class LoopRun:
     def phase(self) -> str:
         """What the shadow is for: `idle`, `shadow`, `proposed`, `watching`."""
         return self._core.state.phase
-
-    @property
-    def has_result(self) -> bool:
-        """Whether a diagnosis, or what stands in its place, counts from the next sample on: no state has it."""
-        return self._found is not None
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -206,7 +201,7 @@ class LoopRun:
             raise DataError(f"state of a run: {error}") from error
         compensation = Compensation(self._config, model_of(self._config, saved.model, source="state of a run"))
         compensation.restore(saved.compensation)
-        core = ModelLoop(self._config, compensation.model, saved.attachments)
+        core = ShadowedLoop(self._config, compensation.model, saved.attachments)
         self._notes = core.loop.restarted()
         self._compensation, self._core = compensation, core
         self._data, self._calibrated = saved.model, saved.calibrated

@@ -12,7 +12,7 @@ from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, NotJudged
 from compensator.messages import UNREADABLE, check_numbers
 from compensator.service.loop.level import ErrorBlocks
-from compensator.service.transfer.comparison import ComparisonState, moved
+from compensator.service.transfer.two_models import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
 STATE_SCHEMA = 9
@@ -58,7 +58,7 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     without: str = ""
 
 
-class Place(msgspec.Struct, kw_only=True):
+class InShadow(msgspec.Struct, kw_only=True):
     """A model in shadow, and what was compared of it and the present model.
 
     Parameters
@@ -156,9 +156,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         For how long nothing has been compared because all models that run suspect a sensor, min.
     uncompared_ns : int
         Since when, ns since 1970 UTC.
-    found : list of Place
+    found : list of InShadow
         What diagnoses have found: candidates, and ways back; and the present model without an effect.
-    watched : Place, optional
+    watched : InShadow, optional
         The model before the last adoption.
     adopted_utc_ns : int
         Time of the last adoption; 0 before.
@@ -194,8 +194,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     usable_min: float = 0.0
     uncompared_min: float = 0.0
     uncompared_ns: int = 0
-    found: list[Place] = []
-    watched: Place | None = None
+    found: list[InShadow] = []
+    watched: InShadow | None = None
     adopted_utc_ns: int = 0
     effects: list[str] = []
     base_effects: list[str] = []
@@ -206,11 +206,11 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     avoided: list[Avoided] = []
 
     @property
-    def taken(self) -> list[Place]:
+    def taken(self) -> list[InShadow]:
         """The models in shadow, the way back first."""
         return [*([self.watched] if self.watched is not None else []), *self.found]
 
-    def place(self, sha256: str) -> Place | None:
+    def place(self, sha256: str) -> InShadow | None:
         """Return the model in shadow with a hash."""
         return next((place for place in self.taken if place.sha256 == sha256), None)
 
@@ -254,7 +254,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
             msgspec.structs.replace(one, until_utc_ns=moved(one.until_utc_ns, by_ns)) for one in self.avoided
         ]
 
-    def remove(self, place: Place) -> None:
+    def remove(self, place: InShadow) -> None:
         """Let a model go."""
         self.watched = None if place is self.watched else self.watched
         self.found = [one for one in self.found if one is not place]
@@ -269,22 +269,22 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         self.probes_shown = []
 
     @property
-    def candidates(self) -> list[Place]:
+    def candidates(self) -> list[InShadow]:
         """The models in shadow that may be adopted."""
         return [place for place in self.found if place.role == "candidate"]
 
     @property
-    def ways_back(self) -> list[Place]:
+    def ways_back(self) -> list[InShadow]:
         """The models in shadow that the service goes back to where they are better."""
         return [place for place in self.taken if place.role == "before"]
 
     @property
-    def candidate(self) -> Place | None:
+    def candidate(self) -> InShadow | None:
         """The candidate that concerns a person: that is proposed, or else shows most."""
         return max(self.candidates, key=lambda place: (place.is_proposed, place.shows), default=None)
 
     @property
-    def proposed(self) -> Place | None:
+    def proposed(self) -> InShadow | None:
         """The candidate that is proposed, if there is one."""
         return next((place for place in self.candidates if place.is_proposed), None)
 
@@ -294,7 +294,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         return self.diagnosis is not None and self.diagnosis.is_next
 
     @property
-    def shown(self) -> Place | None:
+    def shown(self) -> InShadow | None:
         """The model in shadow that concerns a person first: the candidate, or else a model that was in force."""
         return self.candidate or next(iter(self.taken), None)
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from compensator.messages import Candidate, LoopStatus
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
 from compensator.service.loop.state import NO_VERDICT
 from compensator.service.loop.words import named
 from compensator.service.transfer.second_opinion import described
 
 
-def loop_status(core: ModelLoop, candidates: Sequence[Candidate]) -> LoopStatus:
+def loop_status(core: ShadowedLoop, candidates: Sequence[Candidate]) -> LoopStatus:
     """Return what the loop does.
 
     Parameters
     ----------
-    core : ModelLoop
+    core : ShadowedLoop
         The loop.
     candidates : sequence of Candidate
         Records of the last sample.

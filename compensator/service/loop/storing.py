@@ -11,7 +11,7 @@ from compensator.config import Config
 from compensator.errors import CompensatorError, ServiceError
 from compensator.model.effects.names import effect_names
 from compensator.service.compensation import model_of
-from compensator.service.loop.core import ModelLoop
+from compensator.service.loop.core import ShadowedLoop
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 
 log = logging.getLogger("compensator")
@@ -49,7 +49,7 @@ class Storing:
         """Whether a model is being stored."""
         return self._task is not None
 
-    def begin(self, core: ModelLoop) -> None:
+    def begin(self, core: ShadowedLoop) -> None:
         """Store the model in shadow that replaces the present one; then it is used from the next sample on."""
         action, shadow = core.state.exchange, core.incoming
         assert shadow is not None

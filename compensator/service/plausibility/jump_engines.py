@@ -45,7 +45,7 @@ _FITS, _CONTRADICTS, _FITS_PART = 3.0, 4.0, 0.1
 
 
 @dataclass(slots=True)
-class Run:
+class EngineRun:
     """An engine, its last estimate, and that of a zero on a warm machine if one was set since it runs."""
 
     engine: Engine
@@ -89,7 +89,7 @@ class JumpEngines:
 
     Parameters
     ----------
-    believing, shifted : Run
+    believing, shifted : EngineRun
         The engines.
     zero_in_use : Estimate, optional
         What the compensation's engine had estimated at a zero on a warm machine, if one was set since they run.
@@ -100,7 +100,7 @@ class JumpEngines:
         Whether the compensation's engine was given the state of one of them in this sample.
     """
 
-    def __init__(self, believing: Run, shifted: Run, zero_in_use: Estimate | None = None) -> None:
+    def __init__(self, believing: EngineRun, shifted: EngineRun, zero_in_use: Estimate | None = None) -> None:
         self.believing, self.shifted, self.zero_in_use = believing, shifted, zero_in_use
         self.has_given = False
 
@@ -162,7 +162,7 @@ class JumpEngines:
         for run in (self.believing, self.shifted):
             run.engine.shift_reference(t_q_k, at_k)
 
-    def give(self, engine: Engine, run: Run) -> Estimate | None:
+    def give(self, engine: Engine, run: EngineRun) -> Estimate | None:
         """Give the compensation's engine the state of one of them, with its zero, and return its estimate."""
         engine.restore(run.engine.snapshot())
         self.zero_in_use, self.has_given = run.at_zero, True
@@ -554,11 +554,11 @@ def _has_returned(difference: float, std: float, shift: float, first: float) -> 
     return abs(difference) <= near <= _RETURNED_MOST * max(abs(first), abs(shift))
 
 
-def _new_run(model: ThermalModel) -> Run:
-    return Run(Engine(model, bridge_samples=BRIDGED_SAMPLES))
+def _new_run(model: ThermalModel) -> EngineRun:
+    return EngineRun(Engine(model, bridge_samples=BRIDGED_SAMPLES))
 
 
-def _run_of(model: ThermalModel, branch: Branch | None) -> Run | None:
+def _run_of(model: ThermalModel, branch: Branch | None) -> EngineRun | None:
     if branch is None:
         return None
     run = _new_run(model)

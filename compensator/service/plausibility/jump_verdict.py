@@ -11,8 +11,8 @@ from compensator.events import Note
 from compensator.model.engine import Engine, Estimate
 from compensator.service.plausibility.grown_y import GrownY
 from compensator.service.plausibility.jump_engines import (
+    EngineRun,
     JumpEngines,
-    Run,
     contradicts,
     expected_value,
     is_unsteady,
@@ -42,7 +42,7 @@ from compensator.service.plausibility.jump_state import JumpState, Phase
 WATCHED_SAMPLES = 15
 
 
-class Verdict(msgspec.Struct, frozen=True):
+class JumpFinding(msgspec.Struct, frozen=True):
     """What a sample has shown of the channels that have jumped.
 
     Parameters
@@ -84,7 +84,7 @@ class JumpJudge:
     def __init__(self, engine: Engine, engines: JumpEngines, state: JumpState, offered: Mapping[str, float]) -> None:
         self._engine, self._engines, self._state, self._offered = engine, engines, state, offered
 
-    def suspected(self, others: Mapping[str, float], grown_y: GrownY, *, is_alone: bool) -> Verdict:
+    def suspected(self, others: Mapping[str, float], grown_y: GrownY, *, is_alone: bool) -> JumpFinding:
         """Decide whether channels that are not used are used again, and from which engine on.
 
         Parameters
@@ -105,7 +105,7 @@ class JumpJudge:
                 return used
         if state.is_back(needed) and not any(math.isnan(offered[name]) for name in state.jumps):
             if state.leaves_something and is_unsteady(state):
-                return self._settle() if is_alone else Verdict()
+                return self._settle() if is_alone else JumpFinding()
             if state.leaves_something:
                 return self._keep_what_is_left(is_alone=is_alone)
             found = self._accept(engines.shifted, "has returned to what was expected before")
@@ -119,9 +119,9 @@ class JumpJudge:
             return self._settle()
         if is_alone and is_good_enough(state) and not any(map(math.isnan, offered.values())):
             return self._settle(FITS)
-        return Verdict()
+        return JumpFinding()
 
-    def watched(self) -> Verdict:
+    def watched(self) -> JumpFinding:
         """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor."""
         engines, state, offered = self._engines, self._state, self._offered
         is_refuted, only_at = is_unlikely(state), state.is_at_alone
@@ -129,7 +129,7 @@ class JumpJudge:
         is_back = state.is_back(needed_samples(state) if state.phase == Phase.UNCONFIRMED else 1)
         if only_at and is_refuted and not is_back and not state.is_unconfirmed:
             state.phase = Phase.AIR
-            return Verdict(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
+            return JumpFinding(notes=[unconfirmed_note("at_degc", state.jumps["at_degc"].size_k, AIR)])
         # T_Q follows the air as slowly as the machine does: that it has not followed AT shows nothing against AT.
         is_refuted &= not state.is_air or (is_back and state.phase == Phase.AIR)
         if state.is_unconfirmed:
@@ -148,21 +148,21 @@ class JumpJudge:
             if not is_back:
                 notes = [jump_note(name, jump.size_k) for name, jump in state.jumps.items()]
                 state.suspect()
-                return Verdict(estimate, notes)
+                return JumpFinding(estimate, notes)
             if state.leaves_something and not only_at:
                 return self._keep_what_is_left()
             notes = [jump_note(name, jump.size_k, "and has returned") for name, jump in state.jumps.items()]
             if not only_at or (engines.agree() and not state.leaves_something):
-                return Verdict(estimate, notes, ends=True)
+                return JumpFinding(estimate, notes, ends=True)
             # Or a door was open: what the air has done meanwhile stays in the deviation until it is forgotten.
             engines.swap()
             state.keep_what_is_left()
             state.phase = Phase.AIR_RETURNED
             state.start_evidence()
-            return Verdict(estimate, notes)
+            return JumpFinding(estimate, notes)
         if math.isnan(offered["t_q_degc"]):
             state.samples -= 1  # nothing but T_Q speaks for or against AT
-        return Verdict(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
+        return JumpFinding(ends=state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed)
 
     def _is_believing_contradicted(self, grown_y: GrownY) -> bool:
         """Return whether measured Y contradicts the believing engine, by how it stood before the jump and by the zero.
@@ -177,7 +177,7 @@ class JumpJudge:
             and contradicts(grown_y.by_zero, grown_y.zero_std_um, estimate, at_zero)
         )
 
-    def _use_as_before(self, others: Mapping[str, float], grown_y: GrownY) -> Verdict | None:
+    def _use_as_before(self, others: Mapping[str, float], grown_y: GrownY) -> JumpFinding | None:
         """Use channels again that are back to what they showed while they were used: they are unconfirmed, as then.
 
         Not where measured Y contradicts them: it may show in hindsight what was wrong. Then nothing is changed.
@@ -195,9 +195,9 @@ class JumpJudge:
         engines.believe_from_used(engine)
         engines.believing.estimate = estimate
         notes = [unconfirmed_note(name, jump.size_k, AS_USED) for name, jump in state.jumps.items()]
-        return Verdict(estimate, notes, {name: offered[name] for name in names})
+        return JumpFinding(estimate, notes, {name: offered[name] for name in names})
 
-    def _keep_what_is_left(self, *, is_alone: bool = True) -> Verdict:
+    def _keep_what_is_left(self, *, is_alone: bool = True) -> JumpFinding:
         """Begin a smaller jump where a channel has returned by most of one: a couple that was pushed in halfway."""
         engines, state, offered = self._engines, self._state, self._offered
         used = {name: offered[name] for name, jump in state.jumps.items() if not jump.left_k}
@@ -210,12 +210,12 @@ class JumpJudge:
         if is_alone and not is_certain:
             state.phase = Phase.UNCONFIRMED
             notes = [unconfirmed_note(name, jump.size_k, LEFT) for name, jump in state.jumps.items()]
-            return Verdict(estimate, notes, {name: offered[name] for name in state.jumps} | used)
+            return JumpFinding(estimate, notes, {name: offered[name] for name in state.jumps} | used)
         then = f"{LEFT}, and is not used until its new value is confirmed"
         notes = [jump_note(name, jump.size_k, then) for name, jump in state.jumps.items()]
-        return Verdict(estimate, notes, used)
+        return JumpFinding(estimate, notes, used)
 
-    def _settle(self, when: str = RESTED) -> Verdict:
+    def _settle(self, when: str = RESTED) -> JumpFinding:
         """Use a channel of which it is not known whether it is right: it is unconfirmed."""
         engines, state, offered = self._engines, self._state, self._offered
         notes = []
@@ -226,11 +226,11 @@ class JumpJudge:
         estimate = engines.give(self._engine, engines.believing)
         state.phase = Phase.UNCONFIRMED
         state.start_evidence()
-        return Verdict(estimate, notes, {name: offered[name] for name in state.jumps})
+        return JumpFinding(estimate, notes, {name: offered[name] for name in state.jumps})
 
-    def _accept(self, run: Run | None, how: str) -> Verdict:
+    def _accept(self, run: EngineRun | None, how: str) -> JumpFinding:
         engines, state, offered = self._engines, self._state, self._offered
         names = list(state.jumps)
         notes = [accepted_note(name, state.jumps[name].size_k, how) for name in names]
         estimate = engines.give(self._engine, run) if run is not None else None
-        return Verdict(estimate, notes, {name: offered[name] for name in names}, ends=True)
+        return JumpFinding(estimate, notes, {name: offered[name] for name in names}, ends=True)

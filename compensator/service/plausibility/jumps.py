@@ -24,7 +24,7 @@ from compensator.service.plausibility.guards import TEMPERATURES
 from compensator.service.plausibility.hindsight import Hindsight
 from compensator.service.plausibility.jump_signs import JumpSigns, accepted_note
 from compensator.service.plausibility.jump_state import JumpState
-from compensator.service.plausibility.one_jump import Judgement, OneJump, Setup
+from compensator.service.plausibility.one_jump import Judgement, JumpSetup, OneJump
 
 #: Part of the permitted change, or of the smallest jump if that is more, that the temperature itself makes; beyond it a
 #: suspect channel has jumped again.
@@ -44,7 +44,7 @@ class JumpWatch:
         least_k = config.guards.jump_min_k
         period_min = model.period_s / 60.0
         stated = config.plausibility.residual_std_um if config.plausibility is not None else None
-        self._setup = Setup(
+        self._setup = JumpSetup(
             model=model,
             signs=JumpSigns(model, least_k) if least_k is not None else None,
             least_k=math.inf if least_k is None else least_k,

@@ -37,7 +37,7 @@ from compensator.service.plausibility.jump_signs import (
     unconfirmed_note,
 )
 from compensator.service.plausibility.jump_state import JumpState, Phase
-from compensator.service.plausibility.jump_verdict import JumpJudge, Verdict
+from compensator.service.plausibility.jump_verdict import JumpFinding, JumpJudge
 
 
 class Judgement(msgspec.Struct, frozen=True):
@@ -69,7 +69,7 @@ class Judgement(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class JumpSetup:
     """What every watch of a machine shares.
 
     Parameters
@@ -98,13 +98,13 @@ class OneJump:
 
     Parameters
     ----------
-    setup : Setup
+    setup : JumpSetup
         What every watch of the machine shares.
     names : tuple of str
         The channels that may jump here.
     """
 
-    def __init__(self, setup: Setup, names: tuple[str, ...] = TEMPERATURES) -> None:
+    def __init__(self, setup: JumpSetup, names: tuple[str, ...] = TEMPERATURES) -> None:
         self._setup, self._names = setup, names
         self.state = JumpState()
         self._engines: JumpEngines | None = None
@@ -182,7 +182,7 @@ class OneJump:
         )
 
     @classmethod
-    def restored(cls, setup: Setup, state: JumpState, names: tuple[str, ...] = TEMPERATURES) -> OneJump:
+    def restored(cls, setup: JumpSetup, state: JumpState, names: tuple[str, ...] = TEMPERATURES) -> OneJump:
         """Return the watch of a state.
 
         Raises
@@ -457,7 +457,7 @@ class OneJump:
         offered: Mapping[str, float],
         others: Mapping[str, float],
         grown_y: GrownY,
-    ) -> Verdict:
+    ) -> JumpFinding:
         judge = JumpJudge(engine, engines, self.state, offered)
         if not self.state.is_suspect:
             return judge.watched()
@@ -467,7 +467,7 @@ class OneJump:
     def _finish(
         self,
         engine: Engine,
-        verdict: Verdict,
+        verdict: JumpFinding,
         estimate: Estimate | None,
         offered: Mapping[str, float],
         others: Mapping[str, float],

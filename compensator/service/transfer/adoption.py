@@ -30,7 +30,6 @@ from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
-from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
 from compensator.service.transfer.second_opinion import (
     described,
@@ -40,6 +39,7 @@ from compensator.service.transfer.second_opinion import (
     worse_axes,
 )
 from compensator.service.transfer.turns import give_way
+from compensator.service.transfer.two_models import not_judged
 from compensator.service.transfer.warm_up import WARM_UP, Successor, warm_up
 
 log = logging.getLogger("compensator")

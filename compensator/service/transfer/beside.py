@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from operator import attrgetter
 
-from compensator.service.transfer.comparison import BLOCK_NS, Block, ComparedProbe, ComparisonState
+from compensator.service.transfer.two_models import BLOCK_NS, Block, ComparedProbe, ComparisonState
 
 
 def beside(rival: ComparisonState, other: ComparisonState, *, level_um: float = 0.0) -> ComparisonState:

@@ -1,7 +1,7 @@
 """Second opinion before another model takes over: both models on the measured Y on record, and every other axis.
 
 Both run through the same replay of the recordings as a warm-up, about the zeros of the record, with the probes of the
-record. Compared are the last `COMPARED_H` hours (`comparison`), each axis that is measured by its own values.
+record. Compared are the last `COMPARED_H` hours (`two_models`), each axis that is measured by its own values.
 
 Left out: samples before the state of both models is known, without T_Q or AT, while the service suspected a sensor and
 not the model, blocks of a sensor that does not change at all, and probes that both models refuse.
@@ -26,7 +26,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import RecordedStep
 from compensator.service.status import Zero
-from compensator.service.transfer.comparison import FEWEST, Comparison, changed, not_judged
+from compensator.service.transfer.two_models import FEWEST_CHANGES, Comparison, changed, not_judged
 from compensator.service.transfer.warm_up import RecordedRun, Window, usable_steps, window_of
 
 #: How much of the record is compared, h.
@@ -139,7 +139,9 @@ def _described(found: ComparisonData) -> str:
 
 def _why(found: ComparisonData) -> str:
     needed = (
-        f"at least {FEWEST} probes" if found.measured_by == "probe" else f"about {(FEWEST + 2) * BLOCK_MIN / 60:g} h"
+        f"at least {FEWEST_CHANGES} probes"
+        if found.measured_by == "probe"
+        else f"about {(FEWEST_CHANGES + 2) * BLOCK_MIN / 60:g} h"
     )
     return {
         None: "",

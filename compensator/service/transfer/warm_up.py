@@ -22,7 +22,7 @@ from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import RawRecord, decode, files_since, messages, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
-from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
+from compensator.service.replay import ForeignRun, RecordedStep, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.status import Zero
 from compensator.service.transfer.shadow import Shadow
@@ -145,7 +145,7 @@ class RecordedRun:
         self.samples = 0
         #: The zero with the newest sample; None before the first.
         self.zero: Zero | None = None
-        self._free = FreeRun(compensation)
+        self._foreign = ForeignRun(compensation)
         #: Names of the channels that it processes.
         self.channels = frozenset(channel.name for channel in config.channel)
         self._probes = probes
@@ -154,12 +154,12 @@ class RecordedRun:
     @property
     def seq(self) -> int:
         """Number of the last sample or held offset; −1 before the first."""
-        return self._free.seq
+        return self._foreign.seq
 
     @property
     def minutes(self) -> float:
         """Time from the first sample to the last, min."""
-        return (self._free.time_ns - self._first_ns) / (60.0 * NS)
+        return (self._foreign.time_ns - self._first_ns) / (60.0 * NS)
 
     def begin_at_level(self, window: Window) -> None:
         """Take the level at which the model was in force before the window."""
@@ -171,7 +171,7 @@ class RecordedRun:
         Raises
         ------
         DataError
-            As in `FreeRun.run`.
+            As in `ForeignRun.run`.
         """
         if step.sample is not None:
             with suppress(DataError):
@@ -186,14 +186,14 @@ class RecordedRun:
             events = [event for event in step.events if event.kind == EventKind.RESTART]
             sample = msgspec.structs.replace(step.sample, channels=channels)
             step = replace(step, sample=sample, events=events)
-        result = self._free.run(step, commands=self._probes and step.sample is not None)
+        result = self._foreign.run(step, commands=self._probes and step.sample is not None)
         if not isinstance(result, Outcome):
             return None
         # An offset that cannot be read says nothing of them.
         with suppress(DataError):
             if self.compensation.waits_for_resume and step.offset is not None:
                 self.compensation.believe_as_in_force(step.offset.reasons)
-        self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
+        self._first_ns, self.samples = self._first_ns or self._foreign.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from dateutil import tz
 
-from compensator.report import reading
+from compensator.report import cursor
+from compensator.report.cursor import script
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Strip
 from compensator.report.page import Page, Table, html_of
-from compensator.report.reading import script
 
 HOURS = np.arange(0.0, 24.0001, 1.0 / 60.0)
 COURSE = 30.0 * np.sin(HOURS / 3.0)
@@ -86,9 +86,9 @@ def test_points_of_the_picture_lead_back_to_the_data() -> None:
 
 
 def test_times_of_day_follow_the_change_to_summer_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "tzlocal", lambda: tz.gettz("Europe/Prague"))
+    monkeypatch.setattr(cursor, "tzlocal", lambda: tz.gettz("Europe/Prague"))
     day = 1774663200.0 / 86400.0  # 2026-03-28 02:00 UTC; the change is at 01:00 UTC on the 29th
-    offsets = reading._zone(day, day + 2.0)
+    offsets = cursor._zone(day, day + 2.0)
     assert [round(24.0 * offset) for _, offset in offsets] == [1, 2]
     assert offsets[1][0] * 86400.0 == 1774746000.0
 
@@ -96,13 +96,13 @@ def test_times_of_day_follow_the_change_to_summer_time(monkeypatch: pytest.Monke
 def test_a_time_that_is_far_off_costs_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """One record of the year 2262 among those of a day; every change until then is found."""
     asked: list[int] = []
-    monkeypatch.setattr(reading, "tzlocal", lambda: asked.append(1) or tz.gettz("Europe/Prague"))
-    offsets = reading._zone(20_000.0, 106_000.0)
+    monkeypatch.setattr(cursor, "tzlocal", lambda: asked.append(1) or tz.gettz("Europe/Prague"))
+    offsets = cursor._zone(20_000.0, 106_000.0)
     assert len(asked) < 30_000
     hours = [time * 24.0 for time, _ in offsets[1:]]
     assert len(hours) > 2 * 12  # until 2037 at least
     for hour, (_, offset) in zip(hours, offsets[1:], strict=True):
-        assert round(hour) == hour and reading._ahead(round(hour)) == offset != reading._ahead(round(hour) - 1)
+        assert round(hour) == hour and cursor._ahead(round(hour)) == offset != cursor._ahead(round(hour) - 1)
 
 
 HARNESS = """<!doctype html><meta charset="utf-8"><iframe width="1000" height="1400" srcdoc="%s"></iframe>

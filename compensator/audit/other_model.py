@@ -25,7 +25,7 @@ from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import in_order
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome, model_of
-from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_until_damage
+from compensator.service.replay import ForeignRun, RecordedStep, setup_of, steps_until_damage
 from compensator.service.status import Zero
 
 #: Columns of the table of both offsets.
@@ -44,7 +44,7 @@ COLUMNS = (
 
 @dataclass(slots=True)
 class AxisComparison:
-    """Figures of a further axis that was measured, as those of Y in `Comparison`."""
+    """Figures of a further axis that was measured, as those of Y in `OtherModel`."""
 
     residual_before: Spread = field(default_factory=Spread)
     residual_after: Spread = field(default_factory=Spread)
@@ -83,7 +83,7 @@ class AxisComparison:
 
 
 @dataclass(slots=True)
-class Comparison:
+class OtherModel:
     """The recorded model compared with another one.
 
     Parameters
@@ -110,31 +110,6 @@ class Comparison:
     remarks: list[Remark] = field(default_factory=list)
     axes: dict[str, AxisComparison] = field(default_factory=dict)
     only_y: str = ""
-
-    @property
-    def residual_before(self) -> Spread:
-        """Measured − predicted Y of the recorded model."""
-        return self.own.residual_before
-
-    @property
-    def residual_after(self) -> Spread:
-        """Measured − predicted Y of the other model."""
-        return self.own.residual_after
-
-    @property
-    def left_before(self) -> Spread:
-        """Remaining error of Y with the recorded model."""
-        return self.own.left_before
-
-    @property
-    def left_after(self) -> Spread:
-        """Remaining error of Y with the other model."""
-        return self.own.left_after
-
-    @property
-    def offsets(self) -> Spread:
-        """The other offset of Y − the recorded one."""
-        return self.own.offsets
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for `--json`."""
@@ -163,7 +138,7 @@ class Comparison:
         rows = self.rows()
         width = max(map(len, rows))
         lines = [
-            f"{self.samples} samples; {self.residual_before.samples} of them have a residual with both models",
+            f"{self.samples} samples; {self.own.residual_before.samples} of them have a residual with both models",
             f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at",
         ]
         for name, spread in rows.items():
@@ -183,7 +158,7 @@ def compare(
     row: Callable[[Iterable[Any]], Any] | None = None,
     point: Callable[..., None] | None = None,
     data: bytes = b"",
-) -> Comparison:
+) -> OtherModel:
     """Run another model over recordings, in the order of their start.
 
     Parameters
@@ -238,16 +213,16 @@ class _Run:
         data: bytes,
     ) -> None:
         self._model, self._row, self._point, self._data = model, row, point, data
-        self._free: FreeRun | None = None
+        self._foreign: ForeignRun | None = None
         #: Configuration and model of the present file, and names of the recorded models.
         self._config = self._recorded = b""
         self._names: dict[str, None] = {}
-        self._result = Comparison("", model.name)
+        self._result = OtherModel("", model.name)
 
     def add(self, step: RecordedStep, contents: Contents) -> None:
         """Run one group."""
         estimate, offset = step.estimate, step.offset
-        if self._free is None and (step.sample is None or estimate is None):
+        if self._foreign is None and (step.sample is None or estimate is None):
             return
         result = self._ready(step, contents, estimate).run(step)
         if isinstance(result, Outcome) and estimate is not None and offset is not None:
@@ -264,24 +239,24 @@ class _Run:
         """Add a remark on the validity of the figures."""
         self._result.remarks.append(Remark(code, figures))
 
-    def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
+    def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> ForeignRun:
         """Return the run with the other model and the configuration of the file."""
         parts = [contents.attachments.get(name) for name in ("config.toml", "model.toml")]
         data, model = (part.data if part else b"" for part in parts)
-        if self._free is not None and (data, model) == (self._config, self._recorded):
-            return self._free
+        if self._foreign is not None and (data, model) == (self._config, self._recorded):
+            return self._foreign
         config, recorded = setup_of(contents, step.file)
         self._names[recorded.name], self._recorded = None, model
-        if self._free is not None and data == self._config:
-            return self._free
+        if self._foreign is not None and data == self._config:
+            return self._foreign
         try:
-            self._free = FreeRun(self._other(config))
+            self._foreign = ForeignRun(self._other(config))
         except ServiceError as error:
             raise DataError(f"{error} in the recording") from error
         self._config = data
         if estimate is not None:
-            self._begin(self._free.compensation, step, estimate)
-        return self._free
+            self._begin(self._foreign.compensation, step, estimate)
+        return self._foreign
 
     def _other(self, config: Config) -> Compensation:
         """Return a compensation with the other model: of all axes, if it has their parts, else of Y alone."""
@@ -337,7 +312,7 @@ class _Run:
                 (y, before), (other_y, after) = measured
                 one.add(outcome.sample.time_utc_ns / NS, (y, um, before), (other_y, other[axis], after))
 
-    def result(self, paths: Sequence[Path]) -> Comparison:
+    def result(self, paths: Sequence[Path]) -> OtherModel:
         """Return the figures; raise an error that names the files if there are none."""
         if not self._result.samples:
             names = ", ".join(path.name for path in paths[:3])

@@ -14,17 +14,16 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from compensator.clock import HOUR_NS, NS
-from compensator.config import Loop as LoopSettings
+from compensator.config import LoopSettings
 from compensator.diagnose.change import BLOCK_MIN
 from compensator.errors import ServiceError
 from compensator.events import DiagnosisData, LoopAction, Note
 from compensator.service.loop.avoided import avoid
 from compensator.service.loop.choice import Choice
 from compensator.service.loop.compared import Compared
-from compensator.service.loop.ending import end, end_diagnosis, note_of, withdraw
+from compensator.service.loop.ending import FAILED_OUTSIDE, end, end_diagnosis, note_of, withdraw
 from compensator.service.loop.exchanging import decide_exchange, exchanged
 from compensator.service.loop.level import ErrorBlocks, channels_at_zero, is_constant
-from compensator.service.loop.misfit import count_misfit
 from compensator.service.loop.place import (
     falls,
     gives_way,
@@ -33,8 +32,8 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.schedule import begin_again, begin_if_due, errs, pass_planned
-from compensator.service.loop.state import LoopState, Place, Role, Running, same_effects
+from compensator.service.loop.schedule import begin_again, begin_if_due, count_misfit, errs, pass_planned
+from compensator.service.loop.state import InShadow, LoopState, Role, Running, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
     is_contradicted,
@@ -55,12 +54,12 @@ CLEAN_MIN = BLOCK_MIN
 _SEEN = 0.25
 
 
-class Loop:
+class LoopDecisions:
     """Decides about the models of one machine.
 
     Parameters
     ----------
-    settings : config.Loop
+    settings : config.LoopSettings
         `[loop]`.
     period_s : float
         Length of a sample, s.
@@ -84,7 +83,7 @@ class Loop:
         running = self.state.diagnosis
         return None if running is None or running.candidate_sha256 else running
 
-    def compared(self, place: Place) -> Compared:
+    def compared(self, place: InShadow) -> Compared:
         """Return what is compared of a model in shadow and the present one."""
         state = self.state
         alike = sum(one.role == place.role for one in state.taken)
@@ -140,7 +139,7 @@ class Loop:
             state.level_um = 0.0  # that of a decided exchange is one about the zero before
         notes = self._forget_wrong() if was_wrong(present) else []
         notes += self._wait(present, others, is_suspected=suspected)
-        judged: list[Place] = []
+        judged: list[InShadow] = []
         for place in state.taken:
             compared, other = self.compared(place), others[place.sha256]
             beyond = is_limited(other) and not is_limited(present)
@@ -188,7 +187,7 @@ class Loop:
 
     # ------------------------------------------------------------------ decisions about a shadow
 
-    def _decide(self, place: Place, now_ns: int, *, is_judged: bool) -> list[Note]:
+    def _decide(self, place: InShadow, now_ns: int, *, is_judged: bool) -> list[Note]:
         """Decide about one model: whether it ends, or a proposal falls; the model before ends by its time only."""
         was_found = place is not self.state.watched
         if was_found and place.limited_min >= CLEAN_MIN:
@@ -204,7 +203,7 @@ class Loop:
             return withdraw(self.state, place, described(place.verdict))
         return []
 
-    def _choose(self, judged: Sequence[Place], now_ns: int) -> list[Note]:
+    def _choose(self, judged: Sequence[InShadow], now_ns: int) -> list[Note]:
         """Go back, adopt or propose, after new verdicts: nothing else changes what is chosen."""
         choice = Choice(self.state, self._settings, self.compared)
         before = choice.gone_back_to(judged)
@@ -219,14 +218,14 @@ class Loop:
         proposed = choice.proposed(better)
         return self._propose(proposed, choice) if proposed is not None else []
 
-    def _adopt(self, place: Place) -> list[Note]:
+    def _adopt(self, place: InShadow) -> list[Note]:
         notes = decide_exchange(self.state, "adopt", place, self.compared)
         text = f"a better model is adopted: {self._what(place)}; {described(place.verdict)}"
         if self.state.level_um:
             text += f"; its level is shifted by {self.state.level_um:+.1f} µm, to that of measured Y"
         return [*notes, note_of(self.state, place, LoopAction.ADOPT, text)]
 
-    def _propose(self, place: Place, choice: Choice) -> list[Note]:
+    def _propose(self, place: InShadow, choice: Choice) -> list[Note]:
         """Propose a candidate, in the place of one that is proposed already."""
         notes, before = [], self.state.proposed
         if before is not None:
@@ -238,12 +237,12 @@ class Loop:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [*notes, note_of(self.state, place, LoopAction.PROPOSE, text)]
 
-    def _what(self, place: Place) -> str:
+    def _what(self, place: InShadow) -> str:
         """Return what a candidate is, in words."""
         is_known = same_effects(place.effects, self.state.effects)
         return f"{_named(place)}{', newer parameters of the present effects' if is_known else ''}"
 
-    def _go_back(self, place: Place) -> list[Note]:
+    def _go_back(self, place: InShadow) -> list[Note]:
         ended = [one for one in self.state.effects if one not in place.effects]
         to = "the model before" if place is self.state.watched else f"the model without {named(ended)}"
         which = "which alone is right about the zero" if self.compared(place).is_alone_right else "which is better"
@@ -321,7 +320,7 @@ class Loop:
     ) -> None:
         """Begin to compare what a diagnosis has found, whose error on the record is given where it is known."""
         state, before = self.state, with_effects(self.state, role, effects)
-        place = Place(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
+        place = InShadow(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
         place.error = error if error is not None else ErrorBlocks()
         if state.diagnosis is not None and state.diagnosis.found is not None:
             place.off_at_zero = state.diagnosis.found.off_at_zero
@@ -373,7 +372,7 @@ class Loop:
             notes += end_diagnosis(self.state, "dismissed")  # newer parameters of them are refused, too
         return notes
 
-    def meant(self, sha256: str = "") -> Place:
+    def meant(self, sha256: str = "") -> InShadow:
         """Return the candidate that an operator's answer is about, by the beginning of its hash; empty: the first one.
 
         Raises
@@ -421,18 +420,18 @@ class Loop:
         notes = [note for place in self.state.taken for note in end(self.state, place, why, text)]
         return notes + end_diagnosis(self.state, why, text)
 
-    def give_up_one(self, sha256: str, why: str, text: str) -> list[Note]:
+    def give_up_one(self, sha256: str, text: str) -> list[Note]:
         """End a diagnosis, and the shadow with this hash if there is one, for a cause outside of the loop."""
         place = self.state.place(sha256)
-        notes = end(self.state, place, why, text) if place is not None else []
-        return notes + end_diagnosis(self.state, why, text)
+        notes = end(self.state, place, FAILED_OUTSIDE, text) if place is not None else []
+        return notes + end_diagnosis(self.state, FAILED_OUTSIDE, text)
 
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
         return begin_again(self.state)
 
 
-def _named(place: Place) -> str:
+def _named(place: InShadow) -> str:
     return f"{place.sha256[:12]} with {named(place.effects)}"
 
 

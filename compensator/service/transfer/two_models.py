@@ -22,7 +22,7 @@ from compensator.messages import number
 from compensator.messages_axes import AxesEstimate
 from compensator.service.outcome import Outcome
 from compensator.service.probing import UNKNOWN_UM
-from compensator.service.transfer.evidence import evidence, followed
+from compensator.service.transfer.refutation import evidence, followed
 
 #: From this number of standard deviations on one of the models is refuted: by the likelihood (`evidence`).
 DEVIATIONS = 4.0
@@ -31,7 +31,7 @@ SURE_PART = 0.5
 #: A model whose changes are wrong by more than the present one's by less than this part is not worse.
 WORSE_PART = 0.05
 #: Fewer changes of block means, or probes, do not judge a model.
-FEWEST = 8
+FEWEST_CHANGES = 8
 #: The part of a block that must be measured.
 _MEASURED = 0.5
 BLOCK_NS = round(BLOCK_MIN * 60 * NS)
@@ -246,9 +246,9 @@ class Comparison:
         """Return whether the other model is the better one since it has been compared, however clearly."""
         own = self.of_itself().state
         values, other, _ = _changes(own.blocks)
-        if values.size < FEWEST:
+        if values.size < FEWEST_CHANGES:
             values, other = np.array([(probe.own_um, probe.other_um) for probe in own.probes]).reshape(-1, 2).T
-        return values.size >= FEWEST and evidence(values, values - other).likelihood > 0.0
+        return values.size >= FEWEST_CHANGES and evidence(values, values - other).likelihood > 0.0
 
     # ------------------------------------------------------------------ blocks
 
@@ -299,12 +299,12 @@ class Comparison:
             candidate_rms_um=other_rms,
         )
         own, other, moves = _changes(blocks)
-        if own.size < FEWEST:
+        if own.size < FEWEST_CHANGES:
             still = state.still > 0.5 * state.steps
             suspected = NotJudged.SUSPECT if state.suspected > samples else NotJudged.TOO_LITTLE
             return changed(scores, why=NotJudged.UNRELATED if still else suspected)
-        kept = followed(moves, own, own - other, parts=own.size // FEWEST, deviations=deviations)
-        if np.sum(kept) < FEWEST:
+        kept = followed(moves, own, own - other, parts=own.size // FEWEST_CHANGES, deviations=deviations)
+        if np.sum(kept) < FEWEST_CHANGES:
             return changed(scores, why=NotJudged.UNRELATED)
         return self._judged(scores, own[kept], own[kept] - other[kept], deviations)
 
@@ -317,7 +317,7 @@ class Comparison:
             present_rms_um=rms_of(own),
             candidate_rms_um=rms_of(other),
         )
-        if own.size < FEWEST:
+        if own.size < FEWEST_CHANGES:
             return changed(scores, why=NotJudged.TOO_LITTLE)
         # Each model has been corrected by the probes before: what a probe shows beyond that is a change already.
         return self._judged(scores, own, own - other, deviations)
@@ -362,7 +362,7 @@ def _measured(outcome: Outcome, axis: str) -> tuple[float, float]:
 def _about_zero(blocks: list[Block], fewest: float) -> tuple[float, float]:
     """Return the root mean squares of both residuals, µm: about the last zero if enough was measured since, or all."""
     last = [block for block in blocks if block.zeros == blocks[-1].zeros]
-    used = last if sum(block.samples for block in last) >= 2 * FEWEST * fewest else blocks
+    used = last if sum(block.samples for block in last) >= 2 * FEWEST_CHANGES * fewest else blocks
     samples = sum(block.samples for block in used)
     own, other = (math.sqrt(sum(block.squares[i] for block in used) / samples) for i in (0, 1))
     return own, other

@@ -37,7 +37,7 @@ END_IS_BETTER = 0.7
 
 
 def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
-    """Return the function by which a `LoopRun` of this machine diagnoses in its own process."""
+    """Return the function by which an `OfflineLoop` of this machine diagnoses in its own process."""
     return partial(diagnosis_of_record, probe_std_um=config.probe.std_um if config.probe is not None else None)
 
 

@@ -1,4 +1,4 @@
-"""What the script of a page (`reading.js`) needs to zoom a plot and to read values off it."""
+"""What the script of a page (`cursor.js`) needs to zoom a plot and to read values off it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WEEK_H = 168
 @cache
 def script() -> str:
     """Return the script."""
-    return resources.files("compensator.report").joinpath("reading.js").read_text(encoding="utf-8")
+    return resources.files("compensator.report").joinpath("cursor.js").read_text(encoding="utf-8")
 
 
 @cache
