@@ -489,11 +489,15 @@ def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
 
 
 def _is_unseen(base: ThermalModel, measured: Sequence[Measurement]) -> bool:
-    """Return whether a model was calibrated, and on none of these data. What only validated it was not seen."""
+    """Return whether a model was calibrated, and on none of these data. What only validated it was not seen.
+
+    A record with further columns is the same record.
+    """
     named = base.provenance.get("data")
     sources = [one for one in named if isinstance(one, dict)] if isinstance(named, list) else []
-    known = [one.get("sha256") for one in sources if one.get("role") != "validation"]
-    return bool(known) and not any(origin.sha256 in known for one in measured for origin in one.origins)
+    used = [one for one in sources if one.get("role") != "validation"]
+    known = [one.get(key) for one in used for key in ("sha256", "t_q_sha256")]
+    return bool(used) and not any(origin.is_in(known) for one in measured for origin in one.origins)
 
 
 def _stored(base: ThermalModel, sources: list[dict[str, Any]], found: Diagnosis, verdict: str) -> ThermalModel:

@@ -90,6 +90,12 @@ def hash_of(table: Table) -> str:
     return digest.hexdigest()
 
 
+def hash_of_t_q(table: Table) -> str:
+    """Return the SHA-256 of a table's readings of T_Q, by which a record with other columns is known again; or ""."""
+    values = table.columns.get("t_q_degc")
+    return "" if values is None else hashlib.sha256(np.ascontiguousarray(values, dtype="<f8").tobytes()).hexdigest()
+
+
 def frame_of(columns: Mapping[str, Any], index: Any = None) -> Any:
     """Return columns as a DataFrame."""
     return sys.modules["pandas"].DataFrame(columns, index=index)

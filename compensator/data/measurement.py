@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -17,7 +17,7 @@ from compensator import display
 from compensator.codes import DataRemark, Remark
 from compensator.data.cleaning import cleaned, refuse_at_limit
 from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
-from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
+from compensator.data.frames import has_local_time, hash_of, hash_of_t_q, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.probed import of_one_zero
 from compensator.data.record import SampledData, SampledRecord, require
@@ -53,18 +53,26 @@ class Origin:
         The file.
     size : tuple of (int, tuple of str)
         Number of rows, and columns, of a table in memory.
+    t_q_sha256 : str
+        Of the readings of T_Q in a table: the same record with other columns has the same; empty for a recording.
     """
 
     name: str
     sha256: str
     path: Path | None = None
     size: tuple[int, tuple[str, ...]] = (0, ())
+    t_q_sha256: str = ""
 
     def provenance(self) -> dict[str, Any]:
         """Return what a model file says of it."""
+        hashes = {"sha256": self.sha256} | ({"t_q_sha256": self.t_q_sha256} if self.t_q_sha256 else {})
         if self.path is not None:
-            return {"file": self.name, "sha256": self.sha256}
-        return {"table": self.name, "rows": self.size[0], "columns": list(self.size[1]), "sha256": self.sha256}
+            return {"file": self.name} | hashes
+        return {"table": self.name, "rows": self.size[0], "columns": list(self.size[1])} | hashes
+
+    def is_in(self, known: Collection[object]) -> bool:
+        """Return whether the same data, or the same record with other columns, are among some hashes."""
+        return self.sha256 in known or (self.t_q_sha256 != "" and self.t_q_sha256 in known)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -292,10 +300,10 @@ def check_validation(fitted: Sequence[Measurement], validation: Sequence[Measure
     UsageError
         Naming the data.
     """
-    used = {origin.sha256 for measured in fitted for origin in measured.origins}
+    used = {value for measured in fitted for origin in measured.origins for value in (origin.sha256, origin.t_q_sha256)}
     for measured in validation:
         for origin in measured.origins:
-            if origin.sha256 in used:
+            if origin.is_in(used):
                 named = origin.path or origin.name
                 raise UsageError(f"--validate {named}: is used for the fit, expected another run")
 
@@ -313,15 +321,17 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     else:
         table = read_csv(path, data, roles)
     table, remarks = table.measurements_only()
-    table, origins = table.with_roles(roles), (_origin(path, hashlib.sha256(data).hexdigest()),)
-    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=(*left_out, *remarks))
+    table = table.with_roles(roles)
+    origin = _origin(path, hashlib.sha256(data).hexdigest(), hash_of_t_q(table))
+    return Measurement(table=table, label=path.name, origins=(origin,), roles=roles, remarks=(*left_out, *remarks))
 
 
 def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
     table, remarks = table_in_memory(name, source, roles).measurements_only()
-    origin = Origin(name=name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
+    sha256, size, table = hash_of(table), (table.t_s.size, tuple(table.columns)), table.with_roles(roles)
+    origin = Origin(name=name, sha256=sha256, size=size, t_q_sha256=hash_of_t_q(table))
     return Measurement(
-        table=table.with_roles(roles),
+        table=table,
         label=name,
         origins=(origin,),
         roles=roles,
@@ -331,8 +341,8 @@ def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
     )
 
 
-def _origin(path: Path, sha256: str) -> Origin:
-    return Origin(name=path.name, sha256=sha256, path=path)
+def _origin(path: Path, sha256: str, t_q_sha256: str = "") -> Origin:
+    return Origin(name=path.name, sha256=sha256, path=path, t_q_sha256=t_q_sha256)
 
 
 def runs_in(

@@ -320,3 +320,16 @@ def test_whether_a_model_has_seen_the_data_is_known_by_their_hash(known: str, un
     data = {"first": [one, 1], "validated": validated, "nothing": [], "a text": "first"}[known]
     model = dataclasses.replace(tc.load_model("quill"), provenance={"data": data})
     assert (_is_unseen(model, first), _is_unseen(model, second)) == unseen
+
+
+def test_a_record_with_further_columns_has_been_seen(tmp_path: Path) -> None:
+    """A calibration is given the columns that it needs, the diagnosis of the same hours every channel."""
+    more = SMALL | {"y_um": [0.0, 1.0, 2.0], "coolant_degc": [18.0, 18.1, 18.2]}
+    rows = "\n".join(",".join(map(str, row)) for row in [more, *zip(*more.values(), strict=True)])
+    (tmp_path / "more.csv").write_text(rows + "\n", encoding="utf-8")
+    other = more | {"t_q_degc": [20.0, 21.0, 22.1]}
+    (calibrated,) = measurements(SMALL | {"y_um": [0.0, 1.0, 2.0]}, "data", None, needed=True)
+    source = {"role": "fit"} | calibrated.origins[0].provenance()
+    model = dataclasses.replace(tc.load_model("quill"), provenance={"data": [source]})
+    for data, unseen in ((more, False), (tmp_path / "more.csv", False), (other, True)):
+        assert _is_unseen(model, measurements(data, "data", None, needed=True)) is unseen
