@@ -28,7 +28,8 @@ WORSE = 1.25
 LOWERS = 0.97
 #: The same of many values in two cases. Beside a late T_Q a remainder is for the minutes that a dead time hides: they
 #: are most of what is left, or something else is (set on 8 drawn machines, where less than this made the fresh run no
-#: better, and on 2 of another simulator). All channels that take the place of names have nothing but this to show.
+#: better, and on 2 of another simulator). All channels that take the place of names have nothing but this to show, nor
+#: have paths that take the place of those of a calibration on other data.
 LOWERS_CLEARLY = 0.75
 #: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
 #: any slow channel.
@@ -99,14 +100,17 @@ class Deployment:
         return self.refused != ""
 
     @property
-    def needs_known_paths(self) -> bool:
-        """Whether nothing is deployed of a search in which nothing was known of the paths: they stay as they are."""
-        return self.is_refused and self.found.search.evidence.free_paths
+    def foretold_um(self) -> float:
+        """What is left of held-out blocks with what is deployed, µm rms."""
+        return rms_of(self.held_out.nothing if self.is_refused else self.held_out.whole)
 
-    @property
-    def base_foretells_better(self) -> bool:
-        """Whether held-out blocks are predicted better by the base's paths as they are than by those fitted anew."""
-        return self.found.search.evidence.free_paths and rms_of(self.held_out.base) < rms_of(self.held_out.whole)
+    def surpasses(self, kept: Deployment) -> bool:
+        """Return whether paths fitted anew foretell held-out blocks clearly better than all that was found with `kept`.
+
+        A calibration on other data knows more than this record, and what is bent to the record has nothing but this to
+        show for it.
+        """
+        return not self.is_refused and self.foretold_um < LOWERS_CLEARLY * kept.foretold_um
 
 
 def deployment_of(

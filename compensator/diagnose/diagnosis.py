@@ -52,8 +52,8 @@ class DiagnosisOptions:
     keep_paths : bool
         Keep the paths of the base as they are even if its own calibration left much.
     unseen : bool
-        Whether the base was calibrated on other data: its error on these is then to be surpassed by paths that are
-        fitted anew, or they are kept.
+        Whether the base was calibrated on other data: what is found with its paths is then to be surpassed by paths
+        that are fitted anew, or they are kept.
     all_data : bool
         Whether all of the data are searched, also where an effect began within them (`onset`).
     """
@@ -127,9 +127,11 @@ def _as_a_whole(
     """Diagnose data as one: with paths fitted anew where the base is far off, unless nothing comes of that."""
     searched = _searched(model, runs, options, progress, executor_map)
     chosen = searched.chosen
-    if chosen.needs_known_paths or (options.unseen and chosen.base_foretells_better):
+    if chosen.found.search.evidence.free_paths and (chosen.is_refused or options.unseen):
         kept, progress = dataclasses.replace(options, keep_paths=True), after(progress, searched.searches)
-        searched = _searched(model, runs, kept, progress, executor_map, is_off=not options.unseen)
+        beside = _searched(model, runs, kept, progress, executor_map, is_off=not options.unseen)
+        if not chosen.surpasses(beside.chosen):
+            searched = beside
     return _result(model, searched)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from compensator.arrays import Indices, Vector, rms_of
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.findings import Findings, by_base, findings_of, not_deployed
+from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.outcome import Step
@@ -46,11 +46,8 @@ class HeldOut:
     """What is left on every sample by estimates that did not see it, µm; NaN where y is missing.
 
     All data say only how large noise, slow rest and initial states are.
-
-    `base` is left by the base's paths as they are, of which the other blocks set the zero and initial state only.
     """
 
-    base: Vector
     nothing: Vector
     named: Vector
     whole: Vector
@@ -80,7 +77,6 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
             foresight=found.foresight,
             begins_warm=evidence.has_initial_state,
             leaves_late=found.left_in is not None,
-            of_time=not_deployed(found)[1],
             rests=(found.selection.fit.rest, found.selection.before.rest),
         ),
         views,
@@ -93,11 +89,8 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
         for name, one in several.predicted.items():
             left[name][block] = left_of_block(evidence, block, several.knows_zero, one)
     # Nothing is given the better of both: a rest without effects may be that of the effects, and go anywhere.
-    alone, beside = ((left[f"base, {rest}"], left[f"nothing, {rest}"]) for rest in _RESTS)
-    base, nothing = min(alone, beside, key=lambda each: rms_of(each[1]))
     return HeldOut(
-        base=base,
-        nothing=nothing,
+        nothing=min((left[rest] for rest in _RESTS), key=rms_of),
         named=left["named"],
         whole=left["whole"],
         ceiling=left["ceiling"],
@@ -108,9 +101,9 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     )
 
 
-#: With the rest of a search without effects, and with that beside them.
-_RESTS = ("without effects", "beside effects")
-_PREDICTED = (*(f"{name}, {rest}" for rest in _RESTS for name in ("base", "nothing")), "named", "whole", "ceiling")
+#: Nothing, with the rest of a search without effects and with that beside them.
+_RESTS = ("nothing, without effects", "nothing, beside effects")
+_PREDICTED = (*_RESTS, "named", "whole", "ceiling")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,9 +113,9 @@ class _Predictions:
     Parameters
     ----------
     predicted : dict of str or Place to numpy.ndarray, shape (n,)
-        By the names of `_PREDICTED`, µm, each with the zeros and initial states that are most probable beside it: the
-        base's paths as they are, and nothing, with each rest; with the rest beside effects also the named effects,
-        effects and remainder, and all channels. By each place what its effect and those of the places before it add.
+        By the names of `_PREDICTED`, µm, each with the zeros and initial states that are most probable beside it:
+        nothing, with each rest; with the rest beside effects also the named effects, effects and remainder, and all
+        channels. By each place what its effect and those of the places before it add.
     knows_zero : tuple of bool
         For each zero whether it knows it.
     has : numpy.ndarray of int, shape (places,)
@@ -144,7 +137,6 @@ def _predictions(
     foresight: Foresight | None,
     begins_warm: bool,
     leaves_late: bool,
-    of_time: Vector,
     rests: tuple[SlowRest, SlowRest],
 ) -> _Predictions:
     search = partial(findings_of, unobserved=unobserved, grid=grid, foresight=foresight, leaves_late=leaves_late)
@@ -164,10 +156,8 @@ def _predictions(
         whole = (own or own_error_alone(found.selection.before)).added
     beside, alone = (Nuisances(found.search.points, rest).beside for rest in rests)
     added |= {"named": found.named, "whole": whole, "ceiling": found.ceiling}
-    nothing = {"base": by_base(seen) + of_time, "nothing": found.paths}
     predicted = {name: beside(one) for name, one in added.items()}
-    for rest, completed in zip(_RESTS, (alone, beside), strict=True):
-        predicted |= {f"{name}, {rest}": completed(one) for name, one in nothing.items()}
+    predicted |= {rest: completed(found.paths) for rest, completed in zip(_RESTS, (alone, beside), strict=True)}
     return _Predictions(
         predicted=predicted,
         knows_zero=zeros_known(found.search.points),

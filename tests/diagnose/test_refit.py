@@ -15,8 +15,9 @@ from compensator.diagnose.background import LAGS_MIN, Background
 from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.extended_model import with_effects
-from compensator.diagnose.findings import findings_of, in_free_run
+from compensator.diagnose.findings import findings_of
 from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
+from compensator.diagnose.verdict import Judged
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from compensator.model.effects.blocks import FilterBank, lag_or_none
@@ -123,8 +124,12 @@ def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(mode
     codes = [one.code for one in kept.warnings]
     assert ModelWarning.PATHS_KEPT in codes and ModelWarning.FITTED_ANEW not in codes
     silent = dataclasses.replace(model, held_out_rms_um=None)
-    assert diagnosis_module._paths_kept(evidence_of(model, runs), "explained", deployed=True, is_off=False)
-    assert not diagnosis_module._paths_kept(evidence_of(silent, runs), "explained", deployed=True, is_off=False)
+    explained = Judged(verdict="explained", nothing_left=True, hides=False)
+    for one, is_said in ((model, True), (silent, False)):
+        assert (
+            bool(diagnosis_module._paths_kept(evidence_of(one, runs), explained, deployed=True, is_off=False))
+            is is_said
+        )
 
 
 @pytest.mark.parametrize(
@@ -168,36 +173,32 @@ def test_beside_paths_that_were_fitted_anew_the_remainder_has_no_limit(model, se
 
 
 @pytest.mark.usefixtures("found")
-def test_paths_stay_where_the_base_foretells_what_it_has_not_seen_better(model, runs, searches, monkeypatch):
+def test_paths_of_a_calibration_on_other_data_stay_unless_others_foretell_clearly_better(
+    model, runs, searches, monkeypatch
+):
     """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
-    real, asked = diagnosis_module.findings_of, []
+    kept_um = diagnose(model, runs, DiagnosisOptions(keep_paths=True)).after.rms_um
+    real = diagnosis_module.findings_of
+    anew = {"findings_of": searches["findings_of"][0], "held_out_of": searches["held_out_of"][0]}
+    monkeypatch.setattr(diagnosis_module, "findings_of", lambda e: anew["findings_of"] if e.free_paths else real(e))
+    real_held_out = diagnosis_module.held_out_of
+    for share, stay in ((0.7, False), (0.8, True)):
+        scaled = share * kept_um / rms_of(anew["held_out_of"].whole) * anew["held_out_of"].whole
+        foretold = dataclasses.replace(anew["held_out_of"], whole=scaled)
 
-    def findings_of(evidence):
-        asked.append(evidence.free_paths)
-        return searches["findings_of"][0] if evidence.free_paths else real(evidence)
-
-    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
-    real_held_out, anew = diagnosis_module.held_out_of, searches["held_out_of"][0]
-    # Its zero is from the other blocks, as that of the new paths: a little more is left than with its own.
-    assert rms_of(anew.base) > in_free_run(searches["findings_of"][0])[0]
-    for factor, kept in ((0.9, True), (1.1, False)):
-        base = dataclasses.replace(anew, base=factor * anew.whole)
-
-        def held_out_of(found, places, progress, executor_map, base=base):
-            if asked != [True]:
+        def held_out_of(found, places, progress, executor_map, foretold=foretold):
+            if not found.search.evidence.free_paths:
                 return real_held_out(found, places, progress, executor_map)
             progress(4, 4)
-            return base
+            return foretold
 
         monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
-        asked.clear()
         reported = []
         options = DiagnosisOptions(unseen=True)
         again = diagnose(model, runs, options, progress=lambda *steps, reported=reported: reported.append(steps))
-        assert (again.model.dtf == model.dtf) is kept
-        again_steps = [(4, 8), (5, 8), (6, 8), (7, 8), (8, 8)] if kept else []
-        assert reported == [(0, 4), (4, 4), *again_steps]
-        assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is kept
+        assert (again.model.dtf == model.dtf) is stay
+        assert reported == [(0, 4), (4, 4), (4, 8), (5, 8), (6, 8), (7, 8), (8, 8)]
+        assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is stay
 
 
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(model, found, runs):
