@@ -76,6 +76,15 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
     assert seen == set(kinds()) - {"regression"}
 
 
+def test_a_lag_of_the_heat_is_at_rest_whatever_the_first_reading_is():
+    columns, _, _ = record([], 5, 12.0)
+    columns["t_q_degc"][0] += 0.3
+    evidence = evidence_of(QUILL, runs_from(columns))
+    slow = next(h for h in proposals(evidence.context) if h.place[:2] == ("dynamics", "DTF") and h.form == "missing")
+    added = response(evidence, Term(hypothesis=slow, values=(1000.0,), amplitudes=(1.0,)))
+    assert abs(added[0]) < 1e-9 and np.max(np.abs(added)) > 1.0
+
+
 @pytest.mark.parametrize("approximate", [True, False])
 def test_no_temperature_in_degrees_celsius_is_squared(approximate):
     """Its zero is arbitrary, also on a winter day on which it comes near 0; that of a speed is not."""
