@@ -161,7 +161,7 @@ def record(scenarios, seed, hours=36.0, *, noise_k=0.02, noise_um=0.3):
 
 def held_out_errors(nothing: np.ndarray, *, named: np.ndarray, whole: np.ndarray, ceiling: np.ndarray) -> HeldOut:
     """Errors on held-out blocks that are made up: the base is as it was."""
-    return HeldOut(base=nothing, nothing=nothing, named=named, whole=whole, ceiling=ceiling, steps=())
+    return HeldOut(nothing=nothing, named=named, whole=whole, ceiling=ceiling, steps=())
 
 
 def chosen(effects: tuple, *, left: float, worse_um: tuple[float, float] | None = None) -> Deployment:
