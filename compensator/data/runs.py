@@ -139,6 +139,11 @@ class Run:
         """Number of the zero that Y of each sample counts from, from 0, shape (n,)."""
         return np.searchsorted(self.zeros_s, self.t_s)
 
+    def counting_from(self, reference: tuple[float, float]) -> Run:
+        """Return the run with T_Q and AT as changes from another reference, °C."""
+        t_q_k, at_k = self.t_q_degc - reference[0], self.at_degc - reference[1]
+        return dataclasses.replace(self, difference_k=t_q_k - at_k, ambient_k=at_k, reference=reference)
+
     def without_y(self, mask: Mask) -> Run:
         """Return the run without some values of Y."""
         return dataclasses.replace(self, y_um=np.where(mask, np.nan, self.y_um))

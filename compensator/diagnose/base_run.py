@@ -32,15 +32,15 @@ WARM_SHARE = 0.05
 
 
 def without_noise(run: Run) -> Run:
-    """Return a run with the courses of T_Q and AT in place of their readings, as changes from where these begin.
+    """Return a run with the courses of T_Q and AT in place of their readings, which count from where these begin.
 
     A lag is at rest at its first input. By what a course begins beside the reference the plain inverse would begin with
     hundreds of W: as a state of hours they look like a drift, and the engine does not have them.
     """
     t_q, at = run.difference_k + run.ambient_k, run.ambient_k
     t_q, at = course(t_q, noise_std(t_q)), course(at, noise_std(at))
-    t_q, at = t_q - t_q[0], at - at[0]
-    return dataclasses.replace(run, difference_k=t_q - at, ambient_k=at)
+    own = dataclasses.replace(run, difference_k=t_q - at, ambient_k=at)
+    return own.counting_from((own.t_q_degc[0], own.at_degc[0]))
 
 
 def beginnings(runs: Sequence[Run]) -> list[float]:

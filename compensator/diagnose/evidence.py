@@ -273,6 +273,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     apart = no_causes(names, runs)
     runs = [run.bridging(model.channels) for run in runs]
     courses = [without_noise(run) for run in runs]
+    runs = [run.counting_from(course.reference) for run, course in zip(runs, courses, strict=True)]
     begins = beginnings(runs)
     signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
     signals = with_warmths(model, runs, signals)
