@@ -335,7 +335,7 @@ def diagnose(
         Further data on which both models are validated.
     keep_paths : bool
         Keep the paths of the base model as they are. By default they are fitted anew together with the effects where
-        the model misses much of its own calibration.
+        the model misses much of its own calibration; data that it has not seen must show clearly that this is better.
     all_data : bool
         Search all of the data, also where an effect began within them, as with `fit_until_h` and of several axes. By
         default it is then looked for in the time since, if that explains itself clearly better.
