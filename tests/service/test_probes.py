@@ -627,9 +627,9 @@ async def test_a_run_of_another_model_uses_the_probes_that_were_taken(tmp_path: 
     await machine.run(250)
     files = recordings(machine.recordings, MACHINE)
     same = compare(files, machine.daemon._compensation.model)  # type: ignore[union-attr]
-    assert same.samples == 550 and same.offsets.peak == 0.0
+    assert same.samples == 550 and same.own.offsets.peak == 0.0
     other = compare(files, parse_model(other_model(), source="test"))
-    assert 0.0 < other.offsets.rms < 2.5
+    assert 0.0 < other.own.offsets.rms < 2.5
 
 
 # ---------------------------------------------------------------------- when a probe is wanted
