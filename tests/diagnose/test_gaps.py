@@ -1,6 +1,7 @@
 """What a record does not have: T_Q for some minutes, a channel for hours, the time before it began."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -26,6 +27,13 @@ def without(values, first, last):
 
 def found_in(why):
     return [(effect.kind, effect.path, effect.channel) for effect in why.effects]
+
+
+@functools.cache
+def with_an_input(hours=HOURS):
+    """Return the record of a machine with an input, and its diagnosis."""
+    columns, _, _ = record([draw("input", 3, 5.0)], 7, hours)
+    return columns, tc.diagnose("quill", frame(columns))
 
 
 @pytest.mark.parametrize(("first", "minutes"), [(1500, 30), (480, 45), (900, 300)])
@@ -80,11 +88,11 @@ def test_probes_that_are_alone_about_a_zero_are_counted():
     assert "9 probe(s) left out" in remark
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 720), (900, 1500)])
+@pytest.mark.parametrize(("first", "last"), [(0, 300), (400, 700)])
 def test_a_channel_that_is_missing_for_hours_is_not_searched_and_said(first, last):
     """A line through such a gap is another channel than the service has."""
-    columns, _, _ = record([draw("input", 3, 5.0)], 7, HOURS)
-    (channel,) = [effect.channel for effect in tc.diagnose("quill", frame(columns)).effects]
+    columns, found = with_an_input(20.0)
+    (channel,) = [effect.channel for effect in found.effects]
     why = tc.diagnose("quill", frame(columns, **{channel: without(columns[channel], first, last)}))
     assert channel not in [effect.channel for effect in why.effects]
     (remark,) = [remark for remark in why.remarks if remark.code == "column_missing"]
@@ -95,7 +103,7 @@ def test_a_channel_that_is_missing_for_hours_is_not_searched_and_said(first, las
 def test_while_a_channel_of_the_model_is_missing_y_says_nothing(first, last):
     """What its effect adds is not known; a right model lacked a source that no channel shows."""
     machine = [draw("input", 3, 5.0)]
-    base = tc.diagnose("quill", frame(record(machine, 7, HOURS)[0])).model
+    base = with_an_input()[1].model
     (channel,) = base.channels
     columns, _, _ = record(machine, 8, HOURS)
     why = tc.diagnose(base, frame(columns, **{channel: without(columns[channel], first, last)}))
@@ -111,12 +119,12 @@ def test_a_record_that_begins_warm_may_lack_the_channel_by_which_the_model_is_sc
 
 
 def test_a_channel_that_one_of_several_recordings_lacks_is_said():
-    columns, _, _ = record([draw("input", 3, 5.0)], 7, HOURS)
-    channel = tc.diagnose("quill", frame(columns)).effects[0].channel
-    other = {name: values for name, values in record([draw("input", 3, 5.0)], 8, 24.0)[0].items() if name != channel}
+    columns, found = with_an_input(20.0)
+    channel = found.effects[0].channel
+    other = {name: values for name, values in record([draw("input", 3, 5.0)], 8, 12.0)[0].items() if name != channel}
     why = tc.diagnose("quill", [frame(columns), frame(other)])
     (remark,) = [remark for remark in why.remarks if remark.code == "column_missing"]
-    assert f"{channel} is missing for 24.0 h" in remark
+    assert f"{channel} is missing for 12.0 h" in remark
 
 
 @pytest.mark.parametrize("begin", [480, 900])
