@@ -476,8 +476,10 @@ def _diagnose_axis(
         since_utc_s=measured[0].since_utc_s,
         sources=tuple(sources),
     )
+    if not is_extended or result.verdict == found.verdict:
+        return result
     # What runs that took no part leave of the verdict is known once the model has run over them.
-    return dataclasses.replace(result, model=stored(result.verdict)) if is_extended else result
+    return dataclasses.replace(result, model=stored(result.verdict))
 
 
 def _several_zeros(runs: Sequence[Run]) -> list[Remark]:
