@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import html
-import json
-import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
+
+from tests.report.chromium import seen_in
 
 WIDTHS = (360, 1400)
 #: Puts each page into a frame of each width, opens what can be opened, and tells what sticks out.
@@ -43,40 +41,14 @@ SMALLEST = 8.5
 
 
 def seen(pages: dict[str, Path], folder: Path, *options: str) -> list[dict]:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    if browser is None:
-        pytest.skip("chromium is not installed: pages were not looked at in a browser")
     frames = "".join(
         f'<iframe title="{name}" width="{width}" height="900" style="border:0" '
         f'srcdoc="{html.escape(path.read_text(encoding="utf-8"))}"></iframe>'
         for name, path in pages.items()
         for width in WIDTHS
     )
-    harness = folder / "harness.html"
-    harness.write_text(HARNESS % frames, encoding="utf-8")
-    done = subprocess.run(
-        [
-            browser,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            f"--user-data-dir={folder / 'profile'}",
-            "--dump-dom",
-            "--virtual-time-budget=20000",
-            "--enable-logging=stderr",
-            "--window-size=1500,1000",
-            *options,
-            harness.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=True,
-    )
-    assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    found = re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.S)
-    assert found and found[1]
-    return json.loads(html.unescape(found[1]))
+    page, words = HARNESS % frames, "pages were not looked at in a browser"
+    return seen_in(page, folder, "--window-size=1500,1000", *options, budget_ms=20000, otherwise=words)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,6 @@ import hashlib
 import html
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from compensator.report.cursor import script
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Strip
 from compensator.report.page import Page, Table, html_of
+from tests.report.chromium import seen_in
 
 HOURS = np.arange(0.0, 24.0001, 1.0 / 60.0)
 COURSE = 30.0 * np.sin(HOURS / 3.0)
@@ -143,24 +142,8 @@ addEventListener("load", () => {
 
 
 def test_a_plot_is_zoomed_and_read_off(tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    if browser is None:
-        pytest.skip("chromium is not installed: no plot was zoomed")
     text = html_of(Page(title="t", verdict="1.", blocks=[figure()]))
-    harness = tmp_path / "harness.html"
-    harness.write_text(HARNESS % html.escape(text), encoding="utf-8")
-    options = ("--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", "--enable-logging=stderr")
-    done = subprocess.run(
-        [browser, *options, f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", harness.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=True,
-    )
-    assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    found = re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.S)
-    assert found and found[1]
-    seen = json.loads(html.unescape(found[1]))
+    seen = seen_in(HARNESS % html.escape(text), tmp_path, budget_ms=5000, otherwise="no plot was zoomed")
     expected = 30.0 * np.sin(2.0)
     value = re.search(r'([\d.]+) h · measured "Y" ([−\d.]+) µm · AT ([\d.]+) °C$', seen["read"])
     assert value and abs(float(value[1]) - 6.0) < 0.05
