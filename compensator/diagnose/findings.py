@@ -135,7 +135,7 @@ class Findings:
 
     def without_names(self) -> Findings:
         """Return the findings of a search that named nothing, without a remainder."""
-        selection = dataclasses.replace(self.selection, fit=self.selection.before, rivals=())
+        selection = dataclasses.replace(self.selection, fit=self.selection.before)
         return dataclasses.replace(
             self,
             selection=selection,
@@ -203,13 +203,14 @@ def _is_surpassed(found: Findings) -> bool:
     A source has a time and a size of its own for every switching, and leaves to the own error of the paths what it
     does not explain; by the evidence it may win over their change.
     """
-    selection, rms = found.selection, found.search.criterion.rms
-    with_it = rms(selection.fit.terms)
+    search, fit = found.search, found.selection.fit
+    rms = search.criterion.rms
+    with_it = rms(fit.terms)
     return any(
         rms(rival.fit.terms) < with_it
-        for term, rivals in zip(selection.fit.terms, selection.rivals, strict=True)
+        for i, term in enumerate(fit.terms)
         if not term.effect.observed
-        for rival in rivals
+        for rival in search.rivals(fit, i)
     )
 
 

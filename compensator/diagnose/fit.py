@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
+from compensator.diagnose.descent import least_squares
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, factor_of, factored, learned_rest, log_det_of, solution
 from compensator.diagnose.points import Points, SlowRest, raw_columns
@@ -19,9 +19,6 @@ from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place, place_in_words
 
 Start = tuple[Hypothesis, Sequence[float]]
-
-#: A free parameter is at its lower bound where this share of its range is between them.
-_AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,13 +248,8 @@ def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: i
         low = np.array([to_search(free, free.low) for free in problem.free])
         high = np.array([to_search(free, free.high) for free in problem.free])
         ranges = high - low
-        inside = np.clip(x, low + 1e-9 * ranges, high - 1e-9 * ranges)
-        found = least_squares(
-            problem.fun, inside, bounds=(low, high), diff_step=1e-3, xtol=1e-5, ftol=1e-4, max_nfev=evaluations
-        )
-        # The solver stays inside: a dead time of a femtosecond is none.
-        x = np.where(found.x - low < _AT_BOUND * ranges, low, found.x)
-        jacobian = np.asarray(found.jac)[: likelihood.target.size]
+        x, slopes = least_squares(problem.fun, x, low, high, evaluations)
+        jacobian = slopes[: likelihood.target.size]
     return _fitted(problem, x, problem.solve(x), jacobian * ranges)
 
 

@@ -34,7 +34,7 @@ def named_effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...
     few = evidence.is_sparse
     if few:
         errors = with_time_errors(found.fit, errors)
-    for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
+    for i, (term, std) in enumerate(zip(found.terms, errors, strict=True)):
         is_left_in = term is found.left_in
         signal = found.left_in_um if is_left_in else found.responses[i]
 
@@ -52,7 +52,7 @@ def named_effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
                 rms_after_um=rms_without([*found.responses, signal]) if is_left_in else after,
                 signal=signal,
-                rivals=rivals_of(term, rivals, chosen, test),
+                rivals=rivals_of(term, search.rivals(selection.fit, i), chosen, test),
                 replaced=not found.deploys_names,
                 left_in=is_left_in,
             )
@@ -83,7 +83,7 @@ def ranked(found: Findings, effects: Sequence[FoundEffect]) -> tuple[tuple[str, 
     largest, selected = effects[0].place, found.selection.fit
     at = next(i for i, term in enumerate(selected.terms) if term.hypothesis.place == largest)
     best = {selected.terms[at].hypothesis.label: found.search.criterion.compared(selected)}
-    for candidate in found.selection.rivals[at]:
+    for candidate in found.search.rivals(selected, at):
         label = candidate.term.hypothesis.label
         best[label] = min(candidate.rms_um, best.get(label, np.inf))
     return tuple(sorted(best.items(), key=lambda item: item[1]))

@@ -219,7 +219,8 @@ class Points:
         together : int
             How many of the columns belong to one effect.
         """
-        spread = np.std(points, axis=0)
+        about_mean = points - points.mean(axis=0)
+        spread = np.sqrt(np.einsum("ij,ij->j", about_mean, about_mean) / max(len(points), 1))
         if self.foretells:
             spread = np.full(spread.shape, np.max(spread, initial=0.0))
         spread[spread < 1e-12] = 1.0

@@ -56,7 +56,6 @@ class Scan:
 
     def __init__(self, points: Points, hypotheses: Sequence[Hypothesis], grid: Grid | None = None) -> None:
         self.grid = grid or Grid(points.first, {one: _on_grid(points, one) for one in hypotheses if one.grid()})
-        self._points = points
         several: dict[int, list[tuple[Hypothesis, Matrix]]] = {}
         for hypothesis in hypotheses:
             if count := len(hypothesis.grid()):
@@ -75,21 +74,21 @@ class Scan:
             end = begin + sum(table.shape[1] for _, table in some)
             self._where[width], begin = slice(begin, end), end
         self._columns = np.concatenate(tables, axis=1)
+        self._last: _Whitened | None = None
         self._fixed = np.array([not hypothesis.amplitudes for hypothesis, _ in self._starts], dtype=bool)
 
-    def ranked(self, rest: SlowRest, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
+    def ranked(self, likelihood: Likelihood, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
         """Rank the hypotheses whose places are free by what their best grid point adds to the evidence.
 
         Parameters
         ----------
-        rest : SlowRest
-            What no effect explains.
+        likelihood : Likelihood
+            The data with what no effect explains.
         fit : Fit
             What leaves the residual.
         cost : callable
             What a hypothesis costs before the data are seen.
         """
-        likelihood = Likelihood(self._points, rest)
         gains, taken = self._gains(likelihood, fit), fit.places
         best: dict[int, tuple[float, Start]] = {}
         for (hypothesis, values), gain in zip(self._starts, gains.tolist(), strict=True):
@@ -101,7 +100,8 @@ class Scan:
 
     def _gains(self, likelihood: Likelihood, fit: Fit) -> Vector:
         """Return what each grid point adds to the logarithm of the evidence, amplitudes integrated out."""
-        white, taken = likelihood.whitened(self._columns)
+        known = self._whitened(likelihood)
+        white = known.columns
         kept, inner, target = fit.solved(likelihood)
         size = white.shape[0]
         cross, back = kept[:size].T @ white, inner[:, :size] @ white
@@ -109,11 +109,7 @@ class Scan:
         products = white.T @ target[:size]
         gains = list[float]()
         for width, at in self._where.items():
-            gram = (
-                _blocks(white[:, at], white[:, at], width)
-                - _blocks(taken[:, at], taken[:, at], width)
-                - _blocks(cross[:, at], back[:, at], width)
-            )
+            gram = known.grams[width] - _blocks(cross[:, at], back[:, at], width)
             # Rounding of large columns must not take away what the prior adds.
             own = np.maximum(np.diagonal(gram, axis1=1, axis2=2), 0.0)
             unit = np.eye(width)
@@ -124,6 +120,26 @@ class Scan:
             fixed = self._fixed[len(gains) : len(gains) + added.size]
             gains += np.where(fixed, moment[:, 0] - 0.5 * own[:, 0], added).tolist()
         return np.array(gains)
+
+    def _whitened(self, likelihood: Likelihood) -> _Whitened:
+        """Return the columns without noise correlation; several fits are ranked with one rest."""
+        if self._last is None or self._last.rest != likelihood.rest:
+            white, taken = likelihood.whitened(self._columns)
+            grams = {
+                width: _blocks(white[:, at], white[:, at], width) - _blocks(taken[:, at], taken[:, at], width)
+                for width, at in self._where.items()
+            }
+            self._last = _Whitened(likelihood.rest, white, grams)
+        return self._last
+
+
+@dataclass(frozen=True, slots=True)
+class _Whitened:
+    """Columns of a scan with a rest: whitened, and their products after projection, by how many belong together."""
+
+    rest: SlowRest
+    columns: Matrix
+    grams: Mapping[int, Matrix]
 
 
 def _on_grid(points: Points, hypothesis: Hypothesis) -> Matrix:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.standard_errors import deviations
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
+
+T = TypeVar("T")
 
 #: Most effects looked for.
 MOST = 4
@@ -75,15 +79,12 @@ class Selection:
     ----------
     before, fit : Fit
         The fit of nothing, and of the effects found.
-    rivals : tuple of tuple of Alternative
-        For each effect, what else was fitted in its place, best first.
     undecided : tuple of Fit
         Where few values do not decide: effects that may act, best first.
     """
 
     before: Fit
     fit: Fit
-    rivals: tuple[tuple[Alternative, ...], ...] = ()
     undecided: tuple[Fit, ...] = ()
 
 
@@ -110,6 +111,10 @@ class Search:
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
         self._scan = Scan(self.points, self.hypotheses, grid)
         self.criterion = Criterion(evidence, self.hypotheses)
+        # One step after another asks for the same.
+        self._known_proposed: dict[Hashable, list[Fit]] = {}
+        self._known_settled: dict[Hashable, Fit] = {}
+        self._known_rivals: dict[Hashable, tuple[Alternative, ...]] = {}
 
     @property
     def grid(self) -> Grid:
@@ -143,12 +148,7 @@ class Search:
         best = self._foretelling(best, apart_from=small)
         if hidden := self._hidden(undecided, best):
             best = hidden
-        return Selection(
-            before=before,
-            fit=best,
-            rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))),
-            undecided=() if best.terms else undecided,
-        )
+        return Selection(before=before, fit=best, undecided=() if best.terms else undecided)
 
     def _grown(self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place]) -> tuple[Fit, tuple[Fit, ...]]:
         """Add one effect after another while each is worth its cost; return what few values do not decide, too.
@@ -169,7 +169,7 @@ class Search:
             proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
-            candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
+            candidates = [self._settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.criterion.score, default=best)
             if self.criterion.score(better) <= self.criterion.score(best) + expected * EXPECTED:
                 return best, self._undecided(candidates, best)
@@ -218,7 +218,26 @@ class Search:
             return None
         # What can absorb any change of the paths is the own error once more.
         best = min(named, key=lambda fit: (fit.terms[0].hypothesis.effect.background, -self.criterion.score(fit)))
-        return Selection(before=nothing, fit=best, rivals=(self._rivals(best, 0),))
+        return Selection(before=nothing, fit=best)
+
+    def rivals(self, fit: Fit, index: int) -> tuple[Alternative, ...]:
+        """Return what else explains the part of an effect, one for each place, best first."""
+        return _once(self._known_rivals, (_values(fit), index), lambda: self._rivals(fit, index))
+
+    def _rivals(self, fit: Fit, index: int) -> tuple[Alternative, ...]:
+        kept = fit.starts(index)
+        base = fit_terms(fit.likelihood, kept, evaluations=1)
+        found: dict[Place, Alternative] = {}
+        for hypothesis, values in self._scan.ranked(fit.likelihood, base, self.criterion.cost_of):
+            if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
+                other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
+                found[hypothesis.place] = Alternative(
+                    term=other.terms[-1],
+                    fit=other,
+                    rms_um=self.criterion.compared(other),
+                    score=self.criterion.score(other),
+                )
+        return tuple(sorted(found.values(), key=lambda item: item.rms_um))
 
     # ------------------------------------------------------------------ steps
 
@@ -232,14 +251,22 @@ class Search:
             views.append(dataclasses.replace(fit.rest, slow_um=math.sqrt(fit.rest.slow_um * small)))
         return views
 
+    def _settled(self, fit: Fit) -> Fit:
+        return _once(self._known_settled, _values(fit), lambda: settled(fit))
+
     def _proposed(self, fit: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()) -> list[Fit]:
         """Return fits with one effect more, each with the view that suits it, best first."""
+        asked = _values(fit), unobserved and fit.log_evidence, apart_from - fit.places
+        fitted = partial(self._fitted, fit, unobserved=unobserved, apart_from=apart_from)
+        return _once(self._known_proposed, asked, fitted)
+
+    def _fitted(self, fit: Fit, *, unobserved: bool, apart_from: frozenset[Place]) -> list[Fit]:
         views = self._views(fit)
         likelihoods = [Likelihood(self.points, rest) for rest in views]
         found: list[Fit] = []
         seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
-            all_ranked = self._scan.ranked(rest, fit, self.criterion.cost_of)
+            all_ranked = self._scan.ranked(likelihood, fit, self.criterion.cost_of)
             ranked: Iterable[Start] = [start for start in all_ranked if start[0].place not in apart_from][:FITTED]
             if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
@@ -296,14 +323,14 @@ class Search:
             proposed = self._proposed(others, unobserved=False, apart_from=apart_from)
             forms = [one for one in proposed if one.places == fit.places and one.forms != fit.forms]
             for candidate in (*forms[:1], *[one for one in proposed[:2] if one.places != fit.places]):
-                better = settled(candidate)
+                better = self._settled(candidate)
                 fit = better if self.criterion.score(better) > self.criterion.score(fit) else fit
         return fit
 
     def _pruned(self, fit: Fit) -> Fit:
         """Leave out every effect that is not worth its cost, too small to name, or not known apart from the others."""
         while fit.terms:
-            fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
+            fewer = [self._settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
             best = max(range(len(fewer)), key=lambda i: self.criterion.score(fewer[i]))
             small = [i for i, term in enumerate(fit.terms) if not self.criterion.is_worth_naming(term, fewer[i], fit)]
             if not small and not self.evidence.free_paths:
@@ -339,7 +366,7 @@ class Search:
                 for hypothesis in self.hypotheses:
                     if hypothesis.effect.names_background and hypothesis.place not in fit.places:
                         starts = [*fit.starts(i)[:i], (hypothesis, ()), *fit.starts(i)[i:]]
-                        simple = settled(fit_terms(fit.likelihood, starts))
+                        simple = self._settled(fit_terms(fit.likelihood, starts))
                         if without - self.criterion.rms(simple.terms) ** 2 > MOSTLY * all_of_it:
                             return simple
         return fit
@@ -358,11 +385,11 @@ class Search:
             if i is None or not (effect := fit.terms[i].effect).observed:
                 continue
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
-            proposed = self._proposed(others, unobserved=False, apart_from=apart_from | others.places)
+            proposed = self._proposed(others, unobserved=False, apart_from=apart_from)
             least = self.criterion.score(fit) - NEARLY
             # A form of any lags does not take the place of one with a law: it may resemble that.
             others_settled = [
-                settled(one)
+                self._settled(one)
                 for one in proposed[:FITTED]
                 if one.forms != fit.forms and (effect.has_any_form or not one.terms[-1].effect.has_any_form)
             ]
@@ -374,21 +401,17 @@ class Search:
                     fit = near[best]
         return fit
 
-    def _rivals(self, fit: Fit, index: int) -> tuple[Alternative, ...]:
-        """Return what else explains the part of an effect, one for each place, best first."""
-        kept = fit.starts(index)
-        base = fit_terms(fit.likelihood, kept, evaluations=1)
-        found: dict[Place, Alternative] = {}
-        for hypothesis, values in self._scan.ranked(fit.rest, base, self.criterion.cost_of):
-            if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
-                other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
-                found[hypothesis.place] = Alternative(
-                    term=other.terms[-1],
-                    fit=other,
-                    rms_um=self.criterion.compared(other),
-                    score=self.criterion.score(other),
-                )
-        return tuple(sorted(found.values(), key=lambda item: item.rms_um))
+
+def _once(known: dict[Hashable, T], asked: Hashable, found: Callable[[], T]) -> T:
+    """Return what was found for a question, the first time it is asked."""
+    if asked not in known:
+        known[asked] = found()
+    return known[asked]
+
+
+def _values(fit: Fit) -> Hashable:
+    """Return what a fit is made of: the values of its effects, and the rest."""
+    return tuple((term.hypothesis, term.values) for term in fit.terms), fit.rest
 
 
 def _above(hypothesis: Hypothesis, shortest_min: float) -> Hypothesis:

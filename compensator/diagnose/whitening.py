@@ -7,9 +7,11 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from compensator.arrays import Matrix
+from compensator.arrays import Matrix, Vector
 from compensator.diagnose.points import Points, SlowRest
 
+#: A variance goes over so many alike points in one step.
+ALIKE = 8
 #: So many columns are whitened with all of them at once.
 MANY = 400
 
@@ -30,18 +32,17 @@ class Whitening:
         # What is left of a slow process from each point to the next; nothing from run to run.
         phis = points.decays(rest.tau_min)
         phis[points.starts[1:] - 1] = 0.0
-        decays, p = phis**2, stationary
-        predicted: list[float] = []
+        predicted, p = np.empty(points.count), stationary
         for first, end in points.alike:
-            noise, kept = float(points.relative_variance[first]), float(decays[first])
+            noise, kept = float(points.relative_variance[first]), float(phis[first]) ** 2
+            if end - first > ALIKE:
+                predicted[first:end] = _settling(p, stationary, noise, kept, end - first)
+                first, p = end - 1, float(predicted[end - 1])  # noqa: PLW2901
             for i in range(first, end):
-                predicted.append(p)
-                before, p = p, stationary + kept * (p * noise / (p + noise) - stationary)
-                if p == before:  # it stays there, to the last bit
-                    predicted += [p] * (end - i - 1)
-                    break
-        variances = np.array(predicted) + points.relative_variance
-        gains = np.array(predicted) / variances
+                predicted[i] = p
+                p = stationary + kept * (p * noise / (p + noise) - stationary)
+        variances = predicted + points.relative_variance
+        gains = predicted / variances
         self._into = (phis * gains)[:-1, None]
         self._bands = np.ones((2, points.count))
         self._bands[1] = -phis * (1.0 - gains)
@@ -73,3 +74,23 @@ class Whitening:
             predicted += into * table[i]
         white *= self._scale
         return white
+
+
+def _settling(begin: float, stationary: float, noise: float, kept: float, count: int) -> Vector:
+    """Return the variance predicted at each of some points with one noise and one time to the next.
+
+    From point to point it is p → stationary + kept (p noise / (p + noise) − stationary), with two fixed points; how far
+    it is from the one, divided by how far from the other, falls by one factor each time.
+    """
+    new = stationary * (1.0 - kept)
+    half = 0.5 * (new - (1.0 - kept) * noise)
+    root = math.hypot(half, math.sqrt(new * noise))
+    # Neither is a difference of two that are nearly the same.
+    high = half + root if half >= 0.0 else new * noise / (root - half)
+    low = -new * noise / high if half >= 0.0 else half - root
+    log_factor = math.log((low + noise) / (high + noise)) if low + noise > 0.0 else -math.inf
+    ratio = (begin - high) / (begin - low)
+    # 1 − ratio left is `apart`.
+    left = np.exp(log_factor * np.arange(count)) if math.isfinite(log_factor) else np.eye(1, count)[0]
+    apart = (2.0 * root) / (begin - low) - ratio * (left - 1.0)
+    return np.asarray(high + 2.0 * root * ratio * left / apart)

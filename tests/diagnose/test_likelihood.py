@@ -57,12 +57,15 @@ def test_points_are_the_means_of_what_is_used(evidence):
             assert averaged[i] == pytest.approx(np.mean(course[some])), (i, edges[i])
 
 
-def test_whitened_data_have_the_covariance_written_out(evidence):
+@pytest.mark.parametrize(
+    "rest", [REST, SlowRest(0.02, 40.0, 2000.0, 3.0, 0.4, 0.5), SlowRest(2.0, 1e-3, 1.0, 3.0, 0.4, 0.5)]
+)
+def test_whitened_data_have_the_covariance_written_out(evidence, rest):
     held_out = np.zeros(evidence.used.size, dtype=bool)
     held_out[100:301] = True
     for each in (evidence, evidence.without(held_out)):
         points = Points(each)
-        whitening, y, full = Whitening(points, REST), points.residual, covariance(points, REST)
+        whitening, y, full = Whitening(points, rest), points.residual, covariance(points, rest)
         assert float(np.sum(whitening.of(y[:, None]) ** 2)) == pytest.approx(float(y @ np.linalg.solve(full, y)))
         assert whitening.log_det == pytest.approx(float(np.linalg.slogdet(full)[1]))
 
@@ -93,7 +96,7 @@ def test_the_scan_ranks_by_what_a_fit_adds_to_the_evidence(evidence):
     beside = next(one for one in hypotheses if one.amplitudes and one.grid())
     fit = fit_terms(likelihood, [(beside, beside.grid()[0])], evaluations=1)
     base = fit_of(likelihood, fit.columns)
-    for hypothesis, values in scan.ranked(REST, fit, lambda _: 0.0)[:12]:
+    for hypothesis, values in scan.ranked(likelihood, fit, lambda _: 0.0)[:12]:
         columns = points.columns_of(hypothesis, tuple(values))
         best = max(gain(likelihood, fit, points, hypothesis, at) - base for at in hypothesis.grid())
         assert gain(likelihood, fit, points, hypothesis, values) - base == pytest.approx(best, abs=1e-6), columns.shape
