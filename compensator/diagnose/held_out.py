@@ -9,13 +9,15 @@ from functools import partial
 import numpy as np
 
 from compensator.arrays import Indices, Vector, rms_of
+from compensator.diagnose.background import Background
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.foresight import Foresight
 from compensator.diagnose.initial_state import as_begun
+from compensator.diagnose.likelihood import rest_without_effects
 from compensator.diagnose.outcome import Step
 from compensator.diagnose.own_error import own_error_alone
-from compensator.diagnose.points import SlowRest
+from compensator.diagnose.points import Points, SlowRest
 from compensator.diagnose.prediction import FOLDS, Nuisances, left_of_block, zeros_known
 from compensator.diagnose.scan import Grid
 from compensator.display import listed
@@ -56,31 +58,34 @@ class HeldOut:
 
 
 def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> HeldOut:
-    """Repeat the search without each block, and predict it by what that finds."""
+    """Repeat the search without each block, and predict it by what that finds.
+
+    Where all data name nothing and leave no remainder, nothing of what the others name would be deployed: they are not
+    searched, and say only what nothing leaves, and all channels.
+    """
     evidence = found.search.evidence
     blocks = list(evidence.blocks(FOLDS))
     progress(1, len(blocks) + 1)
     views = [evidence.without(block) for block in blocks]
     if evidence.has_initial_state:
         views = [view.with_initial_state(None) for view in views]  # all data say what it was; each view does by itself
-    hidden = [not term.effect.observed for term in found.terms]
-    unobserved = any(hidden) and not all(hidden)
-    # Another process computes the columns sooner than it gets them.
-    grid = found.search.grid if executor_map is map and not evidence.has_initial_state else None
-    predicted = executor_map(
-        partial(
+    rests = found.selection.fit.rest, found.selection.before.rest
+    predictions = partial(_of_channels, rests=rests)
+    if found.terms or found.remainder is not None or evidence.free_paths:
+        hidden = [not term.effect.observed for term in found.terms]
+        predictions = partial(
             _predictions,
             places=places,
             own_alone=found.is_own_error_alone,
-            unobserved=unobserved,
-            grid=grid,
+            unobserved=any(hidden) and not all(hidden),
+            # Another process computes the columns sooner than it gets them.
+            grid=found.search.grid if executor_map is map and not evidence.has_initial_state else None,
             foresight=found.foresight,
             begins_warm=evidence.has_initial_state,
             leaves_late=found.left_in is not None,
-            rests=(found.selection.fit.rest, found.selection.before.rest),
-        ),
-        views,
-    )
+            rests=rests,
+        )
+    predicted = executor_map(predictions, views)
     left = {name: np.full(evidence.used.size, np.nan) for name in (*_PREDICTED, *places)}
     searches = np.zeros(len(places), dtype=int)
     for done, (block, several) in enumerate(zip(blocks, predicted, strict=True), start=2):
@@ -154,15 +159,27 @@ def _predictions(
     if own_alone:
         own = found.remainder if found.is_own_error_alone else None
         whole = (own or own_error_alone(found.selection.before)).added
-    beside, alone = (Nuisances(found.search.points, rest).beside for rest in rests)
     added |= {"named": found.named, "whole": whole, "ceiling": found.ceiling}
+    return _completed(found.search.points, added, found.paths, has, rests)
+
+
+def _of_channels(seen: Evidence, *, rests: tuple[SlowRest, SlowRest]) -> _Predictions:
+    """Return the predictions of a part of the evidence by nothing and by all channels."""
+    points = Points(seen)
+    channels = Background(seen).fitted(points, np.zeros(points.count), rest_without_effects(points)).added
+    nothing = np.zeros(channels.size)
+    added: dict[str | Place, Vector] = {"named": nothing, "whole": nothing, "ceiling": channels}
+    return _completed(points, added, nothing, np.zeros(0, dtype=int), rests)
+
+
+def _completed(
+    points: Points, added: dict[str | Place, Vector], paths: Vector, has: Indices, rests: tuple[SlowRest, SlowRest]
+) -> _Predictions:
+    """Return predictions with the most probable zeros and initial states beside what is added, and beside nothing."""
+    beside, alone = (Nuisances(points, rest).beside for rest in rests)
     predicted = {name: beside(one) for name, one in added.items()}
-    predicted |= {rest: completed(found.paths) for rest, completed in zip(_RESTS, (alone, beside), strict=True)}
-    return _Predictions(
-        predicted=predicted,
-        knows_zero=zeros_known(found.search.points),
-        has=has,
-    )
+    predicted |= {rest: completed(paths) for rest, completed in zip(_RESTS, (alone, beside), strict=True)}
+    return _Predictions(predicted=predicted, knows_zero=zeros_known(points), has=has)
 
 
 def how_held_out(evidence: Evidence, beside: Sequence[str] = ()) -> str:
