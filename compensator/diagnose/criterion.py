@@ -30,6 +30,8 @@ UNSEEN = 15.0
 MOSTLY = 0.7
 #: Columns of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
+#: Effects make up for each other where one is larger than all together by this much.
+MAKES_UP = 2.0
 
 
 class Criterion:
@@ -156,11 +158,23 @@ class Criterion:
         size = float(np.sum(self._evidence.without_nuisances(added) ** 2))
         return size > share * (without_um2 * self._evidence.count + self._evidence.noise.allowance)
 
-    def is_plausible(self, term: Term) -> bool:
-        """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
+    def is_plausible(self, terms: Sequence[Term]) -> bool:
+        """Refuse effects of which the columns of the last cancel, or that make up for each other.
+
+        Two lags that imitate a derivative or a ramp are not physical. Two large effects that leave little together here
+        leave much on another day, and keep what acts from being found.
+        """
+        return not self._cancels(terms[-1]) and (len(terms) < 2 or not self._make_up(terms))
+
+    def _cancels(self, term: Term) -> bool:
         if len(term.amplitudes) < 2 or term.hypothesis.effect.has_any_form:
-            return True
+            return False
         table = raw_columns(self._evidence, term.hypothesis, term.values) * np.array(term.amplitudes)
         table = table[self._evidence.used]
         table = table - table.mean(axis=0)
-        return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
+        return bool(np.max(np.linalg.norm(table, axis=0)) >= CANCELS * np.linalg.norm(table.sum(axis=1)))
+
+    def _make_up(self, terms: Sequence[Term]) -> bool:
+        evidence = self._evidence
+        each = [evidence.without_nuisances(np.where(evidence.used, response(evidence, term), 0.0)) for term in terms]
+        return bool(max(map(np.linalg.norm, each)) > MAKES_UP * np.linalg.norm(sum(each)))

@@ -279,7 +279,7 @@ class Search:
                         continue
                     start = self._at_best_sample(likelihood, fit, start)  # noqa: PLW2901
                 added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
-                if not self.criterion.is_plausible(added.terms[-1]):
+                if not self.criterion.is_plausible(added.terms):
                     continue
                 others = [
                     fit_terms(other, added.starts(), evaluations=1) for other in likelihoods if other is not likelihood
