@@ -256,7 +256,7 @@ class Search:
 
     def _proposed(self, fit: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()) -> list[Fit]:
         """Return fits with one effect more, each with the view that suits it, best first."""
-        asked = _values(fit), unobserved and fit.log_evidence, apart_from - fit.places
+        asked = _values(fit), fit.log_evidence if unobserved else None, apart_from - fit.places
         fitted = partial(self._fitted, fit, unobserved=unobserved, apart_from=apart_from)
         return _once(self._known_proposed, asked, fitted)
 
@@ -403,7 +403,7 @@ class Search:
 
 
 def _once(known: dict[Hashable, T], asked: Hashable, found: Callable[[], T]) -> T:
-    """Return what was found for a question, the first time it is asked."""
+    """Return the answer to a question, found when it is asked for the first time."""
     if asked not in known:
         known[asked] = found()
     return known[asked]

@@ -1,10 +1,11 @@
-"""Which effects may stand beside each other."""
+"""Which effects may stand beside each other, and what a search asks for once."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
+from compensator.diagnose import search as search_module
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import Term, response
 from compensator.diagnose.search import Search
@@ -46,3 +47,14 @@ def test_where_effects_make_up_for_each_other_another_is_proposed(searched, monk
     asked = []
     monkeypatch.setattr(searched.criterion, "_make_up", lambda terms: asked.append(terms) or True)
     assert searched._fitted(fit, unobserved=False, apart_from=frozenset()) == [] and asked
+
+
+def test_no_explanation_is_settled_twice(searched, monkeypatch):
+    """Exchange, foretelling and a second search ask for the same."""
+    settled, asked = search_module.settled, []
+    monkeypatch.setattr(search_module, "settled", lambda fit: asked.append(search_module._values(fit)) or settled(fit))
+    again = Search(searched.evidence, searched.grid)
+    first = again.run()
+    count = len(asked)
+    assert count == len(set(asked)) > 0
+    assert again.run().fit is first.fit and len(asked) == count
