@@ -31,8 +31,8 @@ LOWERS = 0.97
 #: better, and on 2 of another simulator). All channels that take the place of names have nothing but this to show, nor
 #: have paths that take the place of those of a calibration on other data.
 LOWERS_CLEARLY = 0.75
-#: All channels where nothing has a name leave less than this many times as much: a drift of a short record looks like
-#: any slow channel.
+#: All channels where nothing has a name, or only an error of the measurement, leave less than this many times as much:
+#: a drift of a short record, or what the form of one misses, looks like any slow channel.
 LOWERS_BY_FAR = 0.6
 #: In the place of a source that no channel shows, or of names that are refused, they leave less than this share of the
 #: error in free run: where it acts once in each block, held-out blocks refute everything. In less than a day, h,
@@ -181,6 +181,8 @@ def _with_remainder_that_helps(
         helps = whole_um < LOWERS * min(named_um, nothing_um)
     elif late_term(found.selection.fit):
         helps = whole_um < LOWERS_CLEARLY * named_um
+    elif found.is_of_measurement:
+        helps = whole_um < LOWERS_BY_FAR * named_um
     else:
         helps = evidence.free_paths or whole_um <= (named_um if found.deploys_names else min(named_um, nothing_um))
     if helps:

@@ -117,6 +117,11 @@ class Findings:
         return bool(self.terms) and not any(term.effect.observed for term in self.terms)
 
     @property
+    def is_of_measurement(self) -> bool:
+        """Whether all that is named depends on time alone, and is an error of the measurement."""
+        return bool(self.terms) and all(one.effect.observed and not one.effect.deployable for one in self.terms)
+
+    @property
     def corrects_late_t_q(self) -> bool:
         """Whether a late T_Q is named and not left in."""
         return self.left_in is None and late_term(self.selection.fit) is not None

@@ -1,24 +1,39 @@
-"""What is said of held-out blocks where nothing is named: the same as by a search, without one."""
+"""Held-out blocks: what is said of them where nothing is named, and what a remainder has to show on them."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
 from compensator.diagnose import held_out as module
+from compensator.diagnose.deployment import _with_remainder_that_helps
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.held_out import _RESTS, _of_channels, _predictions, held_out_of
 from compensator.diagnose.prediction import FOLDS
 from compensator.model.model_file import load_model
 from compensator.progress import unreported
-from tests.diagnose.scenarios import record
+from tests.diagnose.scenarios import draw, held_out_errors, record
 from tests.identify.quill_runs import runs_from
+
+
+@dataclasses.dataclass
+class Reported:
+    """What is reported of a named effect, as far as it is asked for."""
+
+    replaced: bool = False
+
+
+@functools.cache
+def diagnosed(kind):
+    """What is found in half a day of the published machine with an effect."""
+    return findings_of(evidence_of(load_model("quill"), runs_from(record([draw(kind, 2, 4.0)], 73, 12.0)[0])))
 
 
 @pytest.fixture(scope="module")
 def found():
-    return findings_of(evidence_of(load_model("quill"), runs_from(record([], 73, 12.0)[0])))
+    return diagnosed("none")
 
 
 def test_where_nothing_is_named_no_block_is_searched(found, monkeypatch):
@@ -58,3 +73,19 @@ def test_a_remainder_without_a_name_is_confirmed_by_searches(found, monkeypatch)
     with_one = dataclasses.replace(found, remainder=found.channels)
     held_out_of(with_one, (), unreported, map)
     assert len(asked) == FOLDS
+
+
+@pytest.mark.parametrize(
+    ("kind", "left", "is_deployed"),
+    [("drift", 0.9, False), ("drift", 0.5, True), ("gain DTF", 0.9, True), ("gain DTF", 1.1, False)],
+)
+def test_beside_an_error_of_the_measurement_alone_a_remainder_gains_by_far(kind, left, is_deployed):
+    """What a drift's form misses all channels took in: the fresh run of a right model was 0.68 instead of 0.49 µm."""
+    named = diagnosed(kind)
+    assert named.is_of_measurement is (kind == "drift") and named.deploys_names
+    with_one = dataclasses.replace(named, remainder=named.channels, is_own_error=False)
+    ones = np.ones(named.ceiling.size)
+    errors = held_out_errors(3.0 * ones, named=ones, whole=left * ones, ceiling=ones)
+    found, _, held_out = _with_remainder_that_helps(with_one, (Reported(),), errors)
+    assert (found.remainder is not None) is is_deployed
+    assert held_out.whole[0] == (left if is_deployed else 1.0)
