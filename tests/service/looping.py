@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.clock import NS
 from compensator.config import Config
 from compensator.events import Note
 from compensator.messages import Sample
@@ -21,7 +22,7 @@ from compensator.model.model_writer import dump_model
 from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop
 from compensator.service.outcome import Outcome
 from tests.service.records import QUILL, sample
-from tests.service.simulated import config
+from tests.service.simulated import START_NS, config
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 DAY = 1440
@@ -91,8 +92,9 @@ def machine(
     noise_um: float = 0.4,
     more: Callable[[int], float] = lambda i: 0.0,
     change: Callable[[int, dict[str, float]], None] = lambda i, values: None,
+    start_ns: int = START_NS,
 ) -> Iterator[Sample]:
-    """Samples of a working machine whose coolant acts on Y by 3 µm/K, as much as `acts` says."""
+    """Samples of a working machine whose coolant acts on Y by 3 µm/K, as much as `acts` says; from 6 o'clock on."""
     rng = np.random.default_rng(seed)
     assert QUILL.ttf is not None and QUILL.tdtf is not None
     t, heat = np.arange(samples), heat_w(samples)
@@ -112,7 +114,18 @@ def machine(
             "coolant_degc": float(coolant[i]),
         }
         change(i, values)
-        yield sample(i, values)
+        yield sample(i, values, start_ns=start_ns)
+
+
+#: The first night of `evening`, samples after its beginning.
+NIGHT = 4 * 60
+
+
+def evening(
+    samples: int, acts: Callable[[int], float] = lambda i: 1.0, *, before_night: int = NIGHT, **changes: Any
+) -> Iterator[Sample]:
+    """Samples of that machine from four hours before the first night on: of a day before it few tests say anything."""
+    return machine(samples, acts, start_ns=START_NS + (20 * 60 - before_night) * 60 * NS, **changes)
 
 
 class Night:

@@ -149,12 +149,12 @@ def channel(value: float, quality: str = "good") -> ChannelSample:
     )
 
 
-def sample(seq: int, values: dict[str, float]) -> Sample:
+def sample(seq: int, values: dict[str, float], *, start_ns: int = START_NS) -> Sample:
     return Sample(
         schema=1,
         machine="vmc-07",
         seq=seq,
-        time_utc_ns=START_NS + seq * 60_000_000_000,
+        time_utc_ns=start_ns + seq * 60_000_000_000,
         period_s=60.0,
         channels={name: channel(value) for name, value in values.items()},
     )

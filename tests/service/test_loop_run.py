@@ -25,18 +25,28 @@ from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.audit.made import CONFIG
-from tests.service.looping import DAY, LATER_NS, Night, decisions, errors, extended, machine, run, settings, shown
+from tests.service.looping import (
+    DAY,
+    LATER_NS,
+    NIGHT,
+    Night,
+    decisions,
+    errors,
+    evening,
+    extended,
+    machine,
+    run,
+    settings,
+    shown,
+)
 from tests.service.probed import COOLANT, PROBE, SENSOR
 from tests.service.test_restart import QUILL
-
-#: Samples are counted from 6 o'clock; the first night is 20 h later.
-NIGHT = 20 * 60
 
 
 def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> None:
     night = Night(shown(extended()))
     loop = OfflineLoop(settings(), QUILL, night)
-    steps = run(loop, machine(2 * DAY))
+    steps = run(loop, evening(NIGHT + DAY + 60))
     found = decisions(steps)
     assert [step for _, step, _ in found[:3]] == ["diagnose", "shadow", "adopt"]
     adopted = found[2][0]
@@ -58,7 +68,7 @@ def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> No
 def test_a_candidate_that_is_worse_is_never_adopted() -> None:
     """The diagnosis has found the coolant, and today it does not act."""
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    steps = run(loop, machine(2 * DAY, acts=lambda i: float(i < NIGHT)))
+    steps = run(loop, evening(NIGHT + DAY, acts=lambda i: float(i < NIGHT)))
     found = [decision[1:] for decision in decisions(steps)]
     assert ("end", "worse") in found and "adopt" not in [step for step, _ in found]
     assert loop.effects == ()
@@ -67,7 +77,7 @@ def test_a_candidate_that_is_worse_is_never_adopted() -> None:
 def test_a_candidate_without_a_clear_difference_ends_after_its_time() -> None:
     tables = {"loop": {"policy": "adopt", "shadow_h": 6.0, "watch_h": 24.0}}
     loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended(0.02, 0.001)), shown(None, "adequate")))
-    steps = run(loop, machine(3 * DAY, acts=lambda i: 0.0))
+    steps = run(loop, evening(NIGHT + DAY + 60, acts=lambda i: 0.0))
     found = [decision[1:] for decision in decisions(steps)]
     assert ("end", "no_difference") in found and "adopt" not in [step for step, _ in found]
 
@@ -75,8 +85,8 @@ def test_a_candidate_without_a_clear_difference_ends_after_its_time() -> None:
 def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
     night = Night(shown(extended()), shown(extended()))
     loop = OfflineLoop(settings(), QUILL, night)
-    ends = 2 * DAY
-    steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
+    ends = NIGHT + 960
+    steps = run(loop, evening(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
     found = [(seq, step) for seq, step, _ in decisions(steps) if step in ("adopt", "back")]
     assert [step for _, step in found] == ["adopt", "back"]
     assert ends < found[1][0] < ends + DAY and loop.effects == () and loop.phase == "idle"
@@ -96,8 +106,8 @@ def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
 def test_a_diagnosis_that_explains_nothing_brings_the_calibrated_model_into_shadow(later: Diagnosed) -> None:
     night = Night(shown(extended()), later)
     loop = OfflineLoop(settings(), QUILL, night)
-    ends = 32 * 60
-    steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
+    ends = NIGHT + 720
+    steps = run(loop, evening(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
     found = decisions(steps)
     assert next(step for _, step, _ in found if step in ("adopt", "back")) == "adopt"
     assert loop.effects == ()
@@ -106,7 +116,7 @@ def test_a_diagnosis_that_explains_nothing_brings_the_calibrated_model_into_shad
 @pytest.mark.parametrize("verdict", ["unexplained", "failed"])
 def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) -> None:
     loop = OfflineLoop(settings(), QUILL, Night(Diagnosed(verdict, (), None, "text", "look at the sensor")))
-    steps = run(loop, machine(DAY + 1))
+    steps = run(loop, evening(NIGHT + 60))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", verdict)]
     assert not any(step.candidates for step in steps)
 
@@ -124,14 +134,14 @@ def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) ->
 def test_rubbish_is_refused(model: bytes, why: str) -> None:
     found = Diagnosed("explained", ("input:coolant_degc",), model, "text")
     loop = OfflineLoop(settings(), QUILL, Night(found))
-    steps = run(loop, machine(DAY + 1))
+    steps = run(loop, evening(NIGHT + 60))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", why)]
 
 
 def test_an_effect_of_the_measurement_is_never_part_of_a_candidate() -> None:
     drift = b'\n[[effect]]\nkind = "drift"\nrate_um_per_h = 0.2\n'
     loop = OfflineLoop(settings(), QUILL, Night(Diagnosed("explained", ("drift",), QUILL + drift, "text")))
-    steps = run(loop, machine(DAY + 1))
+    steps = run(loop, evening(NIGHT + 60))
     assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", "refused")]
 
 
@@ -147,7 +157,7 @@ def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -
             values["t_q_degc"] += 0.02 * (i - begins)
 
     loop = OfflineLoop(settings(**CHECKED), QUILL, Night(shown(extended())))
-    source = machine(3 * DAY, acts=lambda i: float(i >= NIGHT), change=drifting)
+    source = evening(ends + 15 * 60, acts=lambda i: float(i >= NIGHT), change=drifting)
     steps = run(loop, source)
     hours = [one.hours for step in steps for one in step.candidates if one.role == "candidate"]
     assert any(later == 0.0 < before for before, later in itertools.pairwise(hours)), "nothing was forgotten"
@@ -163,7 +173,7 @@ def adopted_at(loses: Callable[[int], bool]) -> int:
             values["t_q_degc"] = math.nan
 
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    return next(seq for seq, step, _ in decisions(run(loop, machine(2 * DAY, change=losing))) if step == "adopt")
+    return next(seq for seq, step, _ in decisions(run(loop, evening(NIGHT + 18 * 60, change=losing))) if step == "adopt")
 
 
 def test_what_a_line_loses_now_and_then_keeps_nothing_from_being_decided() -> None:
@@ -177,7 +187,7 @@ def test_what_a_line_loses_now_and_then_keeps_nothing_from_being_decided() -> No
 def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_fault_of_a_sensor() -> None:
     """To a check that knows one model a missing effect looks like a sensor that drifts."""
     loop = OfflineLoop(settings(**CHECKED), QUILL, Night(shown(extended())))
-    steps = run(loop, machine(NIGHT + 60))
+    steps = run(loop, machine(21 * 60))
     alarmed = [step for step in steps if sensor_suspected(step.outcome.offset.reasons)]
     assert len(alarmed) > 240
     found = [decision[1:] for decision in decisions(steps)]
@@ -191,13 +201,13 @@ def test_a_creeping_mount_does_not_make_a_better_model() -> None:
     """From the night on Y creeps by 1 µm/h; the candidate explains it by the coolant, which does not act."""
     creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended(1.0))))
-    steps = run(loop, machine(2 * DAY, acts=lambda i: 0.0, more=creep))
+    steps = run(loop, evening(NIGHT + DAY, acts=lambda i: 0.0, more=creep))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
 def test_a_hand_on_the_machine_is_not_compared() -> None:
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    source = machine(3 * DAY)
+    source = evening(NIGHT + 61 + 600 + 900)
     run(loop, source, NIGHT + 60)
     (before,) = run(loop, source, 1)[0].candidates
     loop.hold()
@@ -212,7 +222,7 @@ def test_after_an_adoption_under_a_hand_the_model_before_is_watched_all_the_same
     tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
     loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended())))
     ends = NIGHT + 600
-    source = machine(NIGHT + 1800, acts=lambda i: float(i < ends))
+    source = evening(NIGHT + 1800, acts=lambda i: float(i < ends))
     run(loop, source, NIGHT + 420)
     assert loop.phase == "proposed"
     loop.hold()
@@ -229,7 +239,7 @@ def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
             values["coolant_degc"] = math.nan
 
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    steps = run(loop, machine(2 * DAY, change=missing))
+    steps = run(loop, evening(NIGHT + DAY, change=missing))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
     last = [one for step in steps for one in step.candidates][-1]
     assert last.hours <= 1.0 and "channel_missing:coolant_degc" in last.reasons
@@ -241,7 +251,7 @@ def test_no_diagnosis_while_sensors_contradict_each_other_or_a_temperature_is_mi
             values["at_degc"] = math.nan
 
     night = Night(shown(None, "adequate"))
-    steps = run(OfflineLoop(settings(), QUILL, night), machine(NIGHT + 200, acts=lambda i: 0.0, change=missing))
+    steps = run(OfflineLoop(settings(), QUILL, night), evening(NIGHT + 200, acts=lambda i: 0.0, change=missing))
     assert NIGHT + 90 + 29 <= decisions(steps)[0][0] <= NIGHT + 90 + 31 and len(night.asked) == 1
 
 
@@ -257,7 +267,7 @@ def test_a_run_continues_from_its_state_with_the_same_bits(lost: tuple[str, ...]
             values.update(dict.fromkeys(lost, math.nan))
 
     one, resumed = whole(), whole()
-    source = machine(NIGHT + 900, change=losing)
+    source = evening(NIGHT + 900, change=losing)
     run(one, source, NIGHT + 300)
     resumed.restore(one.state())
     rest = list(source)
@@ -269,7 +279,7 @@ def test_a_run_continues_from_its_state_with_the_same_bits(lost: tuple[str, ...]
 def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
     night = Night(shown(extended()))
     loop = OfflineLoop(settings(), QUILL, night)
-    source = machine(DAY + 60)
+    source = evening(NIGHT + 60)
     run(loop, source, NIGHT + 1)
     assert len(night.asked) == 1
     again = OfflineLoop(settings(), QUILL, night)
@@ -280,7 +290,7 @@ def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
 
 def test_a_candidate_that_is_new_passes_a_pause_too() -> None:
     """The diagnosis has ended with the last sample before it."""
-    loop, samples = OfflineLoop(settings(), QUILL, Night(shown(extended()))), machine(NIGHT + 120)
+    loop, samples = OfflineLoop(settings(), QUILL, Night(shown(extended()))), evening(NIGHT + 120)
     steps = [loop.process(sample) for sample in itertools.islice(samples, NIGHT - 30)]
     while ("diagnose", "planned") not in [found[1:] for found in decisions(steps)]:
         steps.append(loop.process(next(samples)))
@@ -297,7 +307,7 @@ def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
     tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
     loop = OfflineLoop(settings(**tables), QUILL, Night(shown(extended())))
     ends = NIGHT + 480
-    steps = run(loop, machine(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
+    steps = run(loop, evening(NIGHT + DAY, acts=lambda i: float(i < ends)))
     found = [decision[1:] for decision in decisions(steps)]
     assert found[:3] == [("diagnose", "planned"), ("shadow", ""), ("propose", "")]
     assert ("withdraw", "") in found or ("end", "worse") in found
@@ -358,7 +368,7 @@ def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twic
     """A drift that is named is no reason to wait for a zero: what creeps both models are corrected for."""
     found_by_night = dataclasses.replace(shown(extended()), y_moved_utc_ns=y_moved_utc_ns)
     loop = OfflineLoop(without_sensor(), QUILL, Night(found_by_night))
-    source = list(machine(int(2.4 * DAY), noise_um=0.0))
+    source = list(evening(NIGHT + DAY, noise_um=0.0))
     steps = probed(loop, iter(source), 30)
     assert sum(probe.taken for step in steps for probe in step.outcome.probes) > 40
     found = decisions(steps)
@@ -373,14 +383,14 @@ def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twic
     truth = np.array([number(one.channels["y_um"].mean) for one in source])
     left = truth + np.array([number(step.outcome.offset.y_offset_um) for step in steps])
     adopted = found[2][0]
-    assert np.std(left[adopted + 120 :]) < 0.5 * np.std(left[DAY // 2 : adopted])
+    assert np.std(left[adopted + 120 :]) < 0.5 * np.std(left[NIGHT:adopted])
     last = [one for step in steps for one in step.candidates if one.innovations_um][-1]
     assert (last.role == "before" and last.residual_um is None) or math.isnan(number(last.residual_um))
 
 
 def test_from_probes_alone_a_false_candidate_is_not_adopted() -> None:
     loop = OfflineLoop(without_sensor(), QUILL, Night(shown(extended())))
-    steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0), 30)
+    steps = probed(loop, evening(NIGHT + DAY, noise_um=0.0, acts=lambda i: 0.0), 30)
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
@@ -390,7 +400,7 @@ def test_a_probe_mount_that_creeps_does_not_make_a_better_model() -> None:
     tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
     for gain in (1.0, -1.0):
         loop = OfflineLoop(without_sensor(**tables), QUILL, Night(shown(extended(gain))))
-        steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0, more=creep), 30)
+        steps = probed(loop, evening(NIGHT + DAY, noise_um=0.0, acts=lambda i: 0.0, more=creep), 30)
         assert sum(probe.taken for step in steps[NIGHT:] for probe in step.outcome.probes) > 20
         assert "adopt" not in [step for _, step, _ in decisions(steps)]
 

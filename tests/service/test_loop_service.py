@@ -74,8 +74,9 @@ class Looping(Machine):
         policy: str = "adopt",
         acts: Callable[[int], float] = lambda i: 1.0,
         before_night: int = EVENING,
+        poll_s: float = 60.0,
     ) -> None:
-        data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
+        data = CONFIG.replace(b"poll_interval_s = 10.0", f"poll_interval_s = {poll_s}".encode())
         data += LOOP.replace(b"POLICY", policy.encode())
         start_ns = START_NS + (20 * 60 - before_night) * 60 * NS
         super().__init__(folder, parse_config(data, source="test"), start_ns=start_ns)
@@ -460,8 +461,8 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
 
 
 async def killed_as_the_model_was_stored(folder: Path) -> Looping:
-    """Return a machine whose service was killed between a stored model and its first sample."""
-    machine = Looping(folder, shown(extended()))
+    """Return a machine whose service was killed between a stored model and its first sample: at a poll between."""
+    machine = Looping(folder, shown(extended()), poll_s=30.0)
     copy = folder / "killed"
 
     def stored() -> None:
