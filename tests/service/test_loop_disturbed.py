@@ -19,11 +19,9 @@ from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.schedule import begin_if_due, pass_planned
 from compensator.service.loop.state import LoopState
 from compensator.service.transfer.model_store import sha256_of
-from tests.service.looping import Night, decisions, extended, machine, run, settings, shown
+from tests.service.looping import NIGHT, Night, decisions, evening, extended, run, settings, shown
 from tests.service.test_restart import QUILL
 
-#: Samples are counted from 6 o'clock; the first diagnosis is 20 h later.
-FIRST = 20 * 60
 HOUR_NS = 3_600_000_000_000
 
 
@@ -34,33 +32,33 @@ def moved(one: Sample, hours: float) -> Sample:
 @pytest.mark.parametrize("hours", [-3.0, 3.0])
 def test_a_clock_that_is_set_in_a_shadow_makes_no_decision_earlier(hours: float) -> None:
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    source = machine(FIRST + 2000)
-    steps = run(loop, source, FIRST + 300)
+    source = evening(NIGHT + 17 * 60)
+    steps = run(loop, source, NIGHT + 300)
     steps += run(loop, (moved(one, hours) for one in source))
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
     # At least twelve hours were measured, whatever the clock says, and no hour counts twice.
-    assert len(adopted) == 1 and adopted[0] >= FIRST + 12 * 60
-    assert adopted[0] <= FIRST + 12 * 60 + 5 * 60
+    assert len(adopted) == 1 and adopted[0] >= NIGHT + 12 * 60
+    assert adopted[0] <= NIGHT + 12 * 60 + 5 * 60
 
 
 def test_a_weekend_is_no_time_in_which_a_candidate_was_compared() -> None:
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    source = machine(FIRST + 300 + 3600 + 1500)
-    steps = run(loop, source, FIRST + 300)
+    source = evening(NIGHT + 300 + 3600 + 15 * 60)
+    steps = run(loop, source, NIGHT + 300)
     loop.pause(3600)
     for _ in zip(range(3600), source, strict=False):
         pass
     steps += run(loop, source)
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
     # Twelve hours of measured Y after it: what was before is more than a day ago.
-    assert all(seq >= FIRST + 300 + 3600 + 12 * 60 for seq in adopted)
+    assert all(seq >= NIGHT + 300 + 3600 + 12 * 60 for seq in adopted)
 
 
 def test_a_clock_that_is_behind_by_a_month_ends_nothing_that_waits() -> None:
     """A flat battery: the service starts with a wrong time, which is set right some minutes later."""
     loop = OfflineLoop(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
-    source = machine(FIRST + 1500)
-    run(loop, source, FIRST + 1200)
+    source = evening(NIGHT + 1500)
+    run(loop, source, NIGHT + 1200)
     now_ns = run(loop, source, 1)[0].outcome.sample.time_utc_ns
     avoid(loop._core.state, ["gain:DTF"], now_ns, 168.0)
     assert loop.phase == "proposed"
@@ -76,20 +74,20 @@ def test_a_clock_that_is_behind_by_a_month_ends_nothing_that_waits() -> None:
 def test_after_a_weekend_nothing_is_diagnosed_before_there_is_a_record() -> None:
     """The planned times that have passed meanwhile count as done, and so does what the model has erred by."""
     loop = OfflineLoop(settings(loop={"misfit_h": 2.0}), QUILL, Night(shown(None, "adequate")))
-    source = machine(FIRST + 120 + 3600 + 1000)
-    run(loop, source, FIRST + 120)
+    source = evening(NIGHT + 120 + 3600 + 1000)
+    run(loop, source, NIGHT + 120)
     loop._core.state.misfit_min = 600.0
     loop.pause(3600)
     for _ in zip(range(3600), source, strict=False):
         pass
     begun = [seq for seq, step, _ in decisions(run(loop, source)) if step == "diagnose"]
-    assert begun and begun[0] >= FIRST + 120 + 3600 + 120
+    assert begun and begun[0] >= NIGHT + 120 + 3600 + 120
 
 
 def test_a_person_who_agrees_twice_or_dismisses_then_gets_one_adoption() -> None:
     loop = OfflineLoop(settings(loop={"policy": "propose"}), QUILL, Night(shown(extended())))
-    source = machine(FIRST + 1500)
-    steps = run(loop, source, FIRST + 1200)
+    source = evening(NIGHT + 1500)
+    steps = run(loop, source, NIGHT + 1200)
     assert loop.phase == "proposed"
     loop.accept()
     loop.accept()
@@ -104,7 +102,7 @@ def test_a_person_who_agrees_twice_or_dismisses_then_gets_one_adoption() -> None
 
 def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    run(loop, machine(FIRST + 60))
+    run(loop, evening(NIGHT + 60))
     core = loop._core
     whole = core.attachments()
     present = Compensation(settings(), core.present)
@@ -161,10 +159,10 @@ def test_a_fault_of_a_couple_that_begins_in_a_shadow_makes_no_better_model(fault
     """The candidate explains by the coolant, which does not act, and from the fourth hour on Y is predicted wrong."""
 
     def change(i: int, values: dict[str, float]) -> None:
-        if i >= FIRST + 240:
+        if i >= NIGHT + 240:
             fault(values)
 
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended(1.0))))
-    steps = run(loop, machine(FIRST + 1440, acts=lambda i: 0.0, change=change))
+    steps = run(loop, evening(NIGHT + 15 * 60, acts=lambda i: 0.0, change=change))
     found = [step for _, step, _ in decisions(steps)]
     assert "shadow" in found and "adopt" not in found and loop.effects == ()

@@ -29,11 +29,13 @@ from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE, largest_step
 from tests.service.looping import (
     DAY,
+    NIGHT,
     QUILL,
     Night,
     about,
     decisions,
     errors,
+    evening,
     extended,
     grown,
     machine,
@@ -59,7 +61,7 @@ def test_without_the_effect_that_has_ended_the_service_goes_on_with_the_other() 
     """The coolant stops to act a day after the adoption; the gain stays. No diagnosis finds it."""
     ends, night = 2 * DAY, Night(shown(BOTH))
     loop = OfflineLoop(settings(loop=NIGHTLY, **CHECKED), QUILL_FILE, night)
-    source = machine(4 * DAY, lambda i: float(i < ends), more=grown(0.2))
+    source = machine(ends + 12 * 60, lambda i: float(i < ends), more=grown(0.2))
     steps = run(loop, source)
     (back,) = [seq for seq, step, _ in decisions(steps) if step == "back"]
     assert loop.effects == ("gain:DTF",) and ends < back < ends + DAY // 2
@@ -80,9 +82,9 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
 ) -> None:
     """It does not know its level: measured Y was shifted before. The present level stays."""
     gain = grown(0.2)
-    ends, night = 2 * DAY, Night(shown(BOTH))
+    ends, night = NIGHT + 24 * 60, Night(shown(BOTH))
     loop = OfflineLoop(settings(loop=NIGHTLY | {"policy": policy, "every_h": 12}), QUILL_FILE, night)
-    source = machine(4 * DAY, lambda i: float(i < ends), more=lambda i: gain(i) + 8.0 * (i > 300))
+    source = evening(ends + DAY, lambda i: float(i < ends), more=lambda i: gain(i) + 8.0 * (i > 120))
     steps = run(loop, source, 1)
     while len(loop.effects) < 2:
         steps += run(loop, source, 1)
@@ -93,7 +95,7 @@ def test_what_a_diagnosis_finds_with_fewer_effects_is_a_way_back_where_no_person
     steps = run(loop, source)
     assert {one for _, one, _ in decisions(steps)} & {"adopt", "back", "propose"} == {step}
     if step == "back":
-        assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 2 :])) < 1.0
+        assert loop.effects == ("gain:DTF",) and np.std(errors(steps[-DAY // 3 :])) < 1.0
 
 
 def misfit(*places: InShadow, effects: list[str] = EFFECTS, **changes: Any) -> LoopState:
@@ -165,10 +167,10 @@ def test_a_person_decides_about_the_effects_of_the_calibrated_model() -> None:
 @pytest.mark.parametrize("watch_h", [24.0, 168.0])
 def test_the_last_effect_ends_whether_the_model_before_it_is_still_watched_or_not(watch_h: float) -> None:
     """The diagnoses name it all the time: most of their records have it. So has what was compared until the misfit."""
-    ends = 3 * DAY
+    ends = NIGHT + 2 * DAY
     tables = {"loop": NIGHTLY | {"watch_h": watch_h}} | CHECKED
     loop = OfflineLoop(settings(**tables), QUILL_FILE, Night(shown(extended())))
-    steps = run(loop, machine(4 * DAY, lambda i: float(i < ends)))
+    steps = run(loop, evening(ends + 12 * 60, lambda i: float(i < ends)))
     found = decisions(steps)
     (back,) = [seq for seq, step, _ in found if step == "back"]
     assert ends < back < ends + 10 * 60

@@ -6,6 +6,7 @@ a zero.
 
 import asyncio
 import dataclasses
+import functools
 import json
 import shutil
 
@@ -41,6 +42,7 @@ from tests.service.looping import (
     crept,
     decisions,
     errors,
+    evening,
     extended,
     machine,
     run,
@@ -50,21 +52,25 @@ from tests.service.looping import (
 from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
+#: An effect begins at 18 o'clock, eight hours before the night: so long its level is seen, and was right for six hours.
+BEGAN, NIGHT = 6 * 60, 14 * 60
+from_noon = functools.partial(evening, before_night=NIGHT)
 
-def warm_at_first(i: int, values: dict[str, float]) -> None:
+
+def warm_at_first(i: int, values: dict[str, float], begins: int = BEGAN) -> None:
     """The coolant is 4 K warmer at the zero, while it does not act yet, than later."""
-    values["coolant_degc"] += 4.0 if i < DAY // 2 else 0.0
+    values["coolant_degc"] += 4.0 if i < begins else 0.0
 
 
 def begun(i: int) -> float:
-    return float(i >= DAY // 2)
+    return float(i >= BEGAN)
 
 
 def test_the_level_is_what_measured_y_shows_since_the_effect_began():
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-    steps = run(loop, machine(3 * DAY, begun, change=warm_at_first))
+    steps = run(loop, from_noon(NIGHT + DAY + 60, begun, change=warm_at_first))
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
-    assert len(adopted) == 1 and adopted[0] < 2 * DAY
+    assert len(adopted) == 1 and adopted[0] < NIGHT + 15 * 60
     after = errors(steps)[adopted[0] + 60 :]
     (event,) = [note for step in steps for note in step.events if note.kind == "adopt"]
     assert "y_moved" not in event.data["comparison"] and abs(event.data["level_um"]) == pytest.approx(12.0, abs=1.0)
@@ -75,7 +81,7 @@ def test_the_level_is_what_measured_y_shows_since_the_effect_began():
 def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero_before():
     """The model is stored meanwhile, or the service was killed."""
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(3 * DAY, begun, change=warm_at_first)
+    samples = from_noon(NIGHT + 20 * 60, begun, change=warm_at_first)
     while not loop._core.state.exchange:
         loop.process(next(samples))
     assert abs(loop._core.state.level_um) == pytest.approx(12.0, abs=1.0)
@@ -103,17 +109,17 @@ def test_what_a_model_leaves_while_its_state_is_not_known_is_none_of_its_errors(
 @pytest.mark.parametrize("slip_min", [60, 300])
 def test_a_mount_that_slips_beside_an_effect_that_acts_is_no_level_of_it(slip_min):
     """The effect acts all the time, and the mount slips by 8 µm: the level of the candidate is right, that of Y not."""
-    slip = DAY // 2 + slip_min
+    slip = 12 * 60 + slip_min
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-    steps = run(loop, machine(2 * DAY, more=lambda i: 8.0 * (i >= slip)))
+    steps = run(loop, machine(37 * 60, more=lambda i: 8.0 * (i >= slip)))
     error = errors(steps)[-300:] - 8.0
     assert abs(np.mean(error)) < 4.0
 
 
 def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(3 * DAY, begun, more=crept, change=warm_at_first)
-    steps = run(loop, samples, 2 * DAY)
+    samples = from_noon(NIGHT + 25 * 60, begun, more=crept, change=warm_at_first)
+    steps = run(loop, samples, NIGHT + 15 * 60)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
     loop.accept()
     agreed = len(steps)
@@ -128,14 +134,14 @@ def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it
 
 def test_such_a_candidate_is_adopted_after_a_zero():
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(4 * DAY, begun, more=crept, change=warm_at_first)
-    steps = run(loop, samples, 2 * DAY)
+    samples = from_noon(NIGHT + 35 * 60, begun, more=crept, change=warm_at_first)
+    steps = run(loop, samples, NIGHT + 16 * 60)
     assert loop.phase == "proposed"
     loop.compensation.zero("warm")
     zero = len(steps)
     steps += run(loop, samples)
     (adopted,) = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
-    assert adopted - zero < DAY
+    assert adopted - zero < 18 * 60
     # The error about the zero is what remains of the effect.
     assert np.sqrt(np.mean((errors(steps)[adopted + 60 :] - np.mean(errors(steps)[zero + 1 : zero + 30])) ** 2)) < 3.0
 
@@ -143,25 +149,25 @@ def test_such_a_candidate_is_adopted_after_a_zero():
 def test_what_is_better_about_a_zero_that_a_mount_has_crept_from_shows_no_level():
     """A diagnosis has named the drift: a candidate that follows it would be the better one about the zero, too."""
     found = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
-    samples = machine(3 * DAY)
+    samples = evening(3 * DAY)
     loop = OfflineLoop(settings(), QUILL_FILE, Night(found, shown(extended())))
-    steps = run(loop, samples, 2000)
+    steps = run(loop, samples, 18 * 60)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
     loop.compensation.zero("warm")
-    steps += run(loop, samples, DAY)
+    steps += run(loop, samples, 18 * 60)
     assert "adopt" in [step for _, step, _ in decisions(steps)]
 
 
 def test_what_measured_y_did_before_the_last_zero_says_nothing_against_a_level_about_it():
     """A mount slipped, a person set a zero: diagnoses go on naming the slip for as long as it is on record."""
-    samples = machine(3 * DAY)
+    samples = evening(3 * DAY)
     night = Night(shown(None, "adequate"), shown(extended()))
     loop = OfflineLoop(settings(), QUILL_FILE, night)
-    steps = run(loop, samples, 500)
+    steps = run(loop, samples, 120)
     slipped = steps[-1].outcome.sample.time_utc_ns
     night.found[1] = dataclasses.replace(night.found[1], y_moved_utc_ns=slipped)
     loop.compensation.zero("warm")
-    steps += run(loop, samples, 2 * DAY + 500)
+    steps += run(loop, samples, 2 * DAY - 300)
     assert "adopt" in [step for _, step, _ in decisions(steps)]
 
 
@@ -294,10 +300,10 @@ def test_newer_parameters_that_alone_are_right_about_the_zero_are_better(other_u
 
 
 def test_what_was_found_and_compared_while_a_temperature_was_wrong_goes(monkeypatch):
-    wrong = 1600
+    wrong = 4 * 60 + 400
     monkeypatch.setattr(decisions_module, "was_wrong", lambda outcome: outcome.sample.seq == wrong)
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended()), shown(None, "adequate")))
-    steps = run(loop, machine(2 * DAY))
+    steps = run(loop, evening(4 * 60 + 15 * 60))
     found = [(seq, step, why) for seq, step, why in decisions(steps) if step in ("shadow", "end", "adopt")]
     assert [step for _, step, _ in found] == ["shadow", "end"] and found[1][::2] == (wrong, "was_wrong")
 
@@ -308,7 +314,7 @@ class WarmAtFirst(Looping):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         acted_from = self.device.sources[3]
-        self.device.sources[3] = lambda: acted_from() + (4.0 if self.minute() < DAY else 0.0)
+        self.device.sources[3] = lambda: acted_from() + (4.0 if self.minute() < 2 * BEGAN else 0.0)
         measured = self.device.sources[2]
         self.device.sources[2] = lambda: measured() + crept(self.minute() // 2)
 
@@ -316,7 +322,7 @@ class WarmAtFirst(Looping):
 @pytest.fixture(scope="module")
 def adopted(tmp_path_factory):
     """A service in which a person has adopted a candidate whose level contradicts measured Y."""
-    service = WarmAtFirst(tmp_path_factory.mktemp("level"), shown(extended()), acts=begun, before_night=20 * 60)
+    service = WarmAtFirst(tmp_path_factory.mktemp("level"), shown(extended()), acts=begun, before_night=NIGHT)
 
     async def adopts():
         await service.run(2400, until=in_phase(service, "proposed"))

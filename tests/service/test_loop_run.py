@@ -166,14 +166,16 @@ def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -
 
 
 def adopted_at(loses: Callable[[int], bool]) -> int:
-    """Run two days with an effect, in which T_Q is missing in some samples; return when a model is adopted."""
+    """Run a night and a day with an effect, in which T_Q is missing in some samples; return when a model is adopted."""
 
     def losing(i: int, values: dict[str, float]) -> None:
         if loses(i):
             values["t_q_degc"] = math.nan
 
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    return next(seq for seq, step, _ in decisions(run(loop, evening(NIGHT + 18 * 60, change=losing))) if step == "adopt")
+    return next(
+        seq for seq, step, _ in decisions(run(loop, evening(NIGHT + 18 * 60, change=losing))) if step == "adopt"
+    )
 
 
 def test_what_a_line_loses_now_and_then_keeps_nothing_from_being_decided() -> None:

@@ -75,9 +75,10 @@ class Looping(Machine):
         acts: Callable[[int], float] = lambda i: 1.0,
         before_night: int = EVENING,
         poll_s: float = 60.0,
+        every_h: int = 24,
     ) -> None:
         data = CONFIG.replace(b"poll_interval_s = 10.0", f"poll_interval_s = {poll_s}".encode())
-        data += LOOP.replace(b"POLICY", policy.encode())
+        data += LOOP.replace(b"POLICY", policy.encode()).replace(b"every_h = 24", b"every_h = %d" % every_h)
         start_ns = START_NS + (20 * 60 - before_night) * 60 * NS
         super().__init__(folder, parse_config(data, source="test"), start_ns=start_ns)
         self.config_bytes, self.acts, self.found = data, acts, list(found)
@@ -124,6 +125,19 @@ class Looping(Machine):
         """Return each recorded decision."""
         events = [event for path in recordings(self.recordings, MACHINE) for event in messages(path, ("event",))]
         return [(event.data["step"], event.data.get("why", "")) for event in events if event.kind == "loop"]
+
+    def decides(self, step: str, why: str = "") -> Callable[[Any], bool]:
+        """Return what tells after a sample whether this was decided, by what was published since the sample before."""
+        seen = len(self.published)
+
+        def arrived(_: Any) -> bool:
+            nonlocal seen
+            new, seen = self.published[seen:], len(self.published)
+            events = [msgspec.json.decode(data, type=Event) for name, data in new if name == "event"]
+            made = [(event.data["step"], event.data.get("why", "")) for event in events if event.kind == "loop"]
+            return any(step == one and why in (other, "") for one, other in made)
+
+        return arrived
 
     def candidates(self) -> list[Candidate]:
         return [one for path in recordings(self.recordings, MACHINE) for one in messages(path, ("candidate",))]
@@ -260,7 +274,7 @@ async def test_a_second_answer_to_a_candidate_before_the_first_acts_is_refused(t
 
 
 async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
-    machine = Looping(tmp_path, shown(extended()))
+    machine = Looping(tmp_path, shown(extended()), every_h=8)
     # It is not proposed: who answers has read of another one.
     late = machine.at_sample[EVENING + 50] = Asked(machine, "dismiss")
     other = machine.at_sample[EVENING + 55] = Asked(machine, "dismiss", sha256="0" * 12)
@@ -273,7 +287,7 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
         back()
 
     machine.at_sample[EVENING + 60] = both
-    await machine.run(1440 + EVENING + 60)
+    await machine.run(EVENING + 8 * 60 + 60)
     assert not late.answer["ok"] and "compensator dismiss HASH" in late.answer["text"], late.answer
     assert not other.answer["ok"] and "candidate 000000000000 has given its place" in other.answer["text"]
     assert not short.answer["ok"] and "expected at least 6 digits of a hash" in short.answer["text"]
@@ -533,7 +547,7 @@ async def test_an_exchange_that_is_completed_goes_on_from_what_was_published_whi
 async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine, works, refused = Looping(tmp_path, shown(extended())), model_store.replace_file, list[Path]()
+    machine, works, refused = Looping(tmp_path, shown(extended()), every_h=8), model_store.replace_file, list[Path]()
 
     def full(path: Path, data: bytes, **_: object) -> None:
         refused.append(path)
@@ -547,14 +561,14 @@ async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
     assert "No space left on device" in machine.events("loop")[-1].text
     assert "the present one stays, and it is compared no more" in machine.events("loop")[-1].text
     assert machine.store.in_use() == QUILL and machine.outcomes[-1].offset.model_sha256 == sha256_of(QUILL)
-    # As if nothing had happened: the restart finds no model half stored, and the next night makes another candidate.
+    # The restart finds no model half stored, and the next diagnosis makes another candidate.
     await machine.run(1440, until=in_phase(machine, "shadow"))
     assert machine.steps()[4:] == [("diagnose", "planned"), ("shadow", "")]
     checked(machine)
 
 
 async def test_another_policy_ends_the_shadow_at_the_restart_and_holds_from_then_on(tmp_path: Path) -> None:
-    machine = Looping(tmp_path, shown(extended()))
+    machine = Looping(tmp_path, shown(extended()), every_h=8)
     await machine.run(EVENING + 300)
     assert machine.steps()[-1] == ("shadow", "")
     machine.use(machine.config_bytes.replace(b'policy = "adopt"', b'policy = "propose"'))

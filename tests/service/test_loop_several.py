@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from compensator.service.loop.decisions import LoopDecisions
 from compensator.service.loop.proof import CANDIDATES, shared
 from compensator.service.loop.run import Diagnosed, LoopStep, OfflineLoop
 from compensator.service.loop.state import InShadow, LoopState, Running
-from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
@@ -40,14 +39,13 @@ from tests.service.looping import (
     stronger,
     together,
 )
-from tests.service.test_loop_level import WarmAtFirst, begun, warm_at_first
+from tests.service.test_loop_level import WarmAtFirst, begun, from_noon, warm_at_first
 from tests.service.test_loop_service import EVENING, Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 #: A diagnosis each eight hours, and none of them is adopted before the next one.
 EARLY = {"every_h": 8, "at_utc": "02:00", "shadow_h": 12.0}
 TWICE = {"loop": {"every_h": 12, "shadow_h": 6.0}}
-SAMPLES = 4 * DAY
 #: The first diagnosis is made before the effect begins, the second one after it; what that finds is proposed by now.
 LATER = 36 * 60
 NOTHING = shown(None, "adequate")
@@ -261,7 +259,7 @@ def test_of_several_none_refutes_a_right_model_more_often_than_a_single_one_may(
 
 def test_the_right_candidate_is_adopted_although_a_later_diagnosis_names_another_effect() -> None:
     loop = OfflineLoop(settings(loop=EARLY), QUILL_FILE, Night(shown(extended()), shown(stronger(0.1))))
-    steps = run(loop, machine(2 * DAY))
+    steps = run(loop, machine(DAY + 180))
     assert decided(steps)[:3] == [("shadow", ""), ("shadow", ""), ("adopt", "")] or decided(steps)[:4] == [
         ("shadow", ""),
         ("shadow", ""),
@@ -275,7 +273,7 @@ def test_of_two_that_are_better_the_one_is_adopted_that_the_other_does_not_surpa
     """Half of the effect beside a gain that is not there is better than nothing, and was there first."""
     half = together(extended(1.5), stronger(0.005))
     loop = OfflineLoop(settings(loop=EARLY | {"every_h": 4}), QUILL_FILE, Night(shown(half), shown(extended())))
-    steps = run(loop, machine(2 * DAY))
+    steps = run(loop, machine(DAY + 180))
     (adopted, *_) = events_of(steps, "adopt")
     assert adopted["model_sha256"] == sha256_of(extended())
     at = next(seq for seq, step, _ in decisions(steps) if step == "adopt")
@@ -289,8 +287,8 @@ def adopting(*found: Diagnosed) -> OfflineLoop:
 
 def test_a_proposal_stays_beside_what_explains_less_and_is_adopted_after_a_zero() -> None:
     loop = adopting(NOTHING, shown(extended()), shown(stronger(0.1)))
-    samples = machine(SAMPLES, begun, more=crept, change=warm_at_first)
-    steps = run(loop, samples, 40 * 60)
+    samples = from_noon(50 * 60, begun, more=crept, change=warm_at_first)
+    steps = run(loop, samples, 30 * 60)
     assert decided(steps)[:4] == [("nothing", "nothing_found"), ("shadow", ""), ("propose", ""), ("shadow", "")]
     assert loop.phase == "proposed"
     loop.compensation.zero("warm")
@@ -301,8 +299,10 @@ def test_a_proposal_stays_beside_what_explains_less_and_is_adopted_after_a_zero(
 def test_a_second_effect_beside_the_first_is_proposed_in_its_place_and_says_on_which_figures() -> None:
     both = together(extended(), stronger(0.3))
     loop = adopting(NOTHING, shown(extended()), shown(extended()), shown(both))
-    more = stronger_dtf(0.3, lambda i: i >= LATER)
-    steps = run(loop, machine(SAMPLES, begun, more=more, change=warm_at_first), 60 * 60)
+    # It is right for half a day, so that the mount that crept before leaves its level open for all of the test.
+    begins, more = 12 * 60, stronger_dtf(0.3, lambda i: i >= LATER)
+    warm = functools.partial(warm_at_first, begins=begins)
+    steps = run(loop, machine(52 * 60, lambda i: float(i >= begins), more=more, change=warm))
     made = decided(steps)
     assert made[2:5] == [("propose", ""), ("nothing", "in_shadow"), ("shadow", "")]
     at = made.index(("withdraw", "surpassed"))
@@ -365,7 +365,7 @@ async def test_the_service_runs_them_over_a_kill_and_a_replay_makes_the_same_of_
 
 async def proposed(folder: Path, *found: Any) -> WarmAtFirst:
     """A service that looks twice a day and finds this in turn, run until a candidate is proposed."""
-    service = WarmAtFirst(folder, *found, acts=begun, before_night=8 * 60)
+    service = WarmAtFirst(folder, *found, acts=begun, before_night=14 * 60)
     service.use(service.config_bytes.replace(b"every_h = 24", b"every_h = 12"))
     await service.run(2400, until=in_phase(service, "proposed"))
     return service
@@ -375,12 +375,8 @@ async def test_the_service_proposes_what_surpasses_a_proposal_and_a_replay_decid
     first, second = together(extended(), stronger(0.03)), extended()
     service = await proposed(tmp_path, NOTHING, shown(first), shown(second))
     assert len(service.asked) == 2
-    later: Iterator[int] = itertools.count()
-
-    def is_surpassed(_: Outcome) -> bool:
-        return any(event.data.get("why") == "surpassed" for event in service.events("loop")) and next(later) == 20
-
-    await service.run(2400, until=is_surpassed)
+    await service.run(2400, until=service.decides("withdraw", "surpassed"))
+    await service.run(20)
     steps = [step for step in service.steps() if step[0] != "diagnose"]
     at = steps.index(("withdraw", "surpassed"))
     assert steps[at - 2 : at + 2] == [("propose", ""), ("shadow", ""), ("withdraw", "surpassed"), ("propose", "")]

@@ -12,14 +12,14 @@ from compensator.service.compensation import Compensation
 from compensator.service.loop.run import OfflineLoop, warmed_on
 from compensator.service.outcome import Outcome, sets_zero_at_rest
 from compensator.service.transfer.shadow import Shadow
-from tests.service.looping import QUILL_FILE, Night, extended, machine, settings, shown, stronger
+from tests.service.looping import QUILL_FILE, Night, evening, extended, machine, settings, shown, stronger
 
-RECORD = 3000
+RECORD = 1400
 
 
 def raised(i: int, values: dict[str, float]) -> None:
-    """The coolant is 4 K warmer from the second day on than it was at the zero."""
-    values["coolant_degc"] += 4.0 if i > 1440 else 0.0
+    """The coolant is 4 K warmer after six hours than it was at the zero."""
+    values["coolant_degc"] += 4.0 if i > 360 else 0.0
 
 
 def outcomes(samples: int, **changes: Any) -> list[Outcome]:
@@ -29,7 +29,7 @@ def outcomes(samples: int, **changes: Any) -> list[Outcome]:
 
 @pytest.fixture(scope="module")
 def record() -> list[Outcome]:
-    return outcomes(5800)
+    return outcomes(2400)
 
 
 def predicted(compensation: Compensation) -> float:
@@ -49,11 +49,11 @@ def test_a_candidate_counts_its_channel_from_the_zero_at_rest_before_the_record(
 
 def test_a_pause_in_the_record_counts(record: list[Outcome]) -> None:
     model = parse_model(extended(3.0), source="candidate")
-    gap = [outcome for outcome in record if not 5600 <= outcome.sample.seq < 5700]
+    gap = [outcome for outcome in record if not 2200 <= outcome.sample.seq < 2300]
     paused = warmed_on(settings(), model, gap)
     by_hand = Compensation(settings(), model)
     for outcome in gap:
-        if outcome.sample.seq == 5700:
+        if outcome.sample.seq == 2300:
             by_hand.pause(100)
         by_hand.process(outcome.sample)
     assert predicted(paused) == pytest.approx(predicted(by_hand), abs=1e-9)
@@ -78,7 +78,7 @@ def test_a_clock_that_was_set_is_no_pause(record: list[Outcome], hours: int) -> 
         msgspec.structs.replace(
             one, sample=msgspec.structs.replace(one.sample, time_utc_ns=one.sample.time_utc_ns + later_ns)
         )
-        if one.sample.seq > 5790
+        if one.sample.seq > 2390
         else one
         for one in record
     ]
@@ -91,16 +91,16 @@ def test_a_restart_in_the_record_counts_although_numbers_go_on(kills: bool) -> N
 
     def first_prediction(left_out: int) -> float:
         loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
-        for one in machine(4000):
-            if 500 <= one.seq < 600:
+        for one in evening(1000):
+            if 50 <= one.seq < 150:
                 continue
-            if one.seq == 600:
+            if one.seq == 150:
                 loop.pause(100)
-            if one.seq == 650 and kills:
+            if one.seq == 200 and kills:
                 state = loop.state()
                 loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
                 loop.restore(state)
-            number = one.seq if one.seq < 600 else one.seq - 100 + left_out
+            number = one.seq if one.seq < 150 else one.seq - 100 + left_out
             if candidates := loop.process(msgspec.structs.replace(one, seq=number)).candidates:
                 return candidates[0].y_pred_um
         raise AssertionError("no candidate")

@@ -334,7 +334,7 @@ def test_the_result_of_a_diagnosis_that_has_ended_is_not_taken_for_that_of_the_n
 
 
 async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_the_same_of_both(tmp_path: Path) -> None:
-    machine = Looping(tmp_path, shown(extended()), shown(extended(2.0)))
+    machine = Looping(tmp_path, shown(extended()), shown(extended(2.0)), every_h=8)
     await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     await machine.run(1200, until=in_phase(machine, "shadow"))
     await machine.run_and_kill(100)
@@ -359,7 +359,7 @@ async def test_the_service_keeps_both_shadows_over_a_kill_and_its_replay_makes_t
 async def test_a_candidate_in_its_warm_up_does_not_take_the_place_after_an_operators_yes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine = Looping(tmp_path, shown(extended()), shown(stronger(0.1)), policy="propose")
+    machine = Looping(tmp_path, shown(extended()), shown(stronger(0.1)), policy="propose", every_h=8)
     machine.use(machine.config_bytes.replace(b"shadow_h = 6.0", b"shadow_h = 48.0"))
     await machine.run(1800, until=in_phase(machine, "shadow"))
     works, adopted, warmed = warm_up.warm_up, threading.Event(), threading.Event()
