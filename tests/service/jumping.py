@@ -79,9 +79,9 @@ def zero_at(sample_number: int) -> Act:
 
 
 @functools.cache
-def undisturbed(zero: int | None = None) -> np.ndarray:
+def undisturbed(zero: int | None = None, *, y: bool = False) -> np.ndarray:
     """Offsets of the working day on which nothing is wrong, with a zero at a sample: most tests compare with them."""
-    found = offsets(run(working_day(), act=nothing if zero is None else zero_at(zero)))
+    found = offsets(run(working_day(), act=nothing if zero is None else zero_at(zero), y=y))
     found.flags.writeable = False
     return found
 

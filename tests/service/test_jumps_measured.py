@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from compensator.model.transfer_function import TransferFunction
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.trust import was_wrong
 from compensator.service.state import decode_state, frozen_state
-from tests.service.jumping import Change, offsets, readings, run, settings, steps, working_day
+from tests.service.jumping import Change, offsets, readings, run, settings, steps, undisturbed, working_day
 from tests.service.records import QUILL, direct, sample
 
 
@@ -44,7 +45,7 @@ def test_measured_y_speaks_for_a_mended_channel_though_it_was_wrong_before_it_ju
     """The mend is the jump: against the level of Y before it the mended channel is the wrong one."""
     outcomes = run(day, sticks(begin, end), y=True)
     assert "suspect_channel:t_q_degc" in outcomes[end + 2].offset.reasons
-    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed(y=True)) > 5.0
     assert not wrong[end + 90 :].any()
     assert outcomes[end + 180].offset.state == "ok"
 
@@ -67,28 +68,32 @@ def test_after_a_drift_is_mended_the_offset_is_right_within_an_hour(
     """What it has shown for hours is in the state: measured Y, not time, puts that right."""
     outcomes = followed(day, drifts(channel, k_per_h, 180, end), residual_std_um=0.3, false_alarm_days=30.0)
     assert f"suspect_channel:{channel}" in outcomes[end + 1].offset.reasons
-    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True)))
+    wrong = np.abs(offsets(outcomes) - undisturbed(y=True))
     assert np.max(wrong[end : end + 5]) > 5.0 and np.max(wrong[end + 60 :]) < 5.0
     assert any("measured Y shows that it was wrong" in note.text for o in outcomes for note in o.notes)
     assert any(was_wrong(outcome) for outcome in outcomes)
 
 
+@functools.cache
+def curved(form: str, change: float) -> tuple[ThermalModel, dict[str, np.ndarray], np.ndarray]:
+    """A model with a curve, the day of a machine that is as it says, and the offsets where nothing is wrong."""
+    curve = effect_from("nonlinear", {"path": "DTF", "form": form, "change": change})
+    model, day = dataclasses.replace(QUILL, effects=(curve,), y_std_um=0.5), working_day()
+    columns = day | {"y_um": np.array([number(o.estimate.y_pred_um) for o in run(day, model=model)])}
+    return model, columns, offsets(run(columns, model=model, y=True))
+
+
 @pytest.mark.parametrize("form", ["square", "odd square", "cube"])
 @pytest.mark.parametrize("change", [-0.6, 1.0, 3.0])
 @pytest.mark.parametrize("channel", ["t_q_degc", "at_degc"])
-def test_a_curve_of_the_model_does_not_lead_a_hindsight_astray(
-    day: dict[str, np.ndarray], form: str, change: float, channel: str
-) -> None:
+def test_a_curve_of_the_model_does_not_lead_a_hindsight_astray(form: str, change: float, channel: str) -> None:
     """Y corrects the state of three engines, one of them without T_Q: a curve amplifies each correction."""
-    curve = effect_from("nonlinear", {"path": "DTF", "form": form, "change": change})
-    model = dataclasses.replace(QUILL, effects=(curve,), y_std_um=0.5)
-    healthy = [number(o.estimate.y_pred_um) for o in run(day, model=model)]
-    columns = day | {"y_um": np.array(healthy)}
+    model, columns, right = curved(form, change)
     mend = 420
     outcomes = followed(
         columns, drifts(channel, 1.5, 180, mend), model=model, residual_std_um=0.5, false_alarm_days=30.0
     )
-    wrong = np.abs(offsets(outcomes) - offsets(run(columns, model=model, y=True)))
+    wrong = np.abs(offsets(outcomes) - right)
     assert np.all(np.isfinite(wrong[1:]))
     late = [i for i, o in enumerate(outcomes) if i > mend + 60 and o.offset.state == "ok" and wrong[i] > 5.0]
     assert not late
@@ -139,7 +144,7 @@ def test_the_model_confirms_nothing_that_measured_y_contradicts(
         values["t_q_degc"] += t_q_k if (i - loose_from) // 3 in on else 0.0
 
     outcomes = followed(day, change, residual_std_um=0.3, false_alarm_days=30.0)
-    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed(y=True)) > 5.0
     assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes))
     assert all("suspect_channel:at_degc" in o.offset.reasons for o in outcomes[begin + 1 : end])
     assert not wrong[end + 60 :].any()
@@ -190,7 +195,7 @@ def test_a_mended_channel_is_used_again_where_y_has_more_noise_than_the_model_er
 
     outcomes = followed(day, change, residual_std_um=0.06, false_alarm_days=30.0, sensor_must_fit=True)
     assert any("suspect_channel:t_q_degc" in o.offset.reasons for o in outcomes[begin:])
-    wrong = np.abs(offsets(outcomes) - offsets(run(day, y=True))) > 5.0
+    wrong = np.abs(offsets(outcomes) - undisturbed(y=True)) > 5.0
     assert not wrong[end + 90 :].any() and not any(o.offset.state == "hold" for o in outcomes[end + 90 :])
 
 

@@ -27,7 +27,7 @@ from compensator.service.transfer.refutation import evidence
 from compensator.service.transfer.second_opinion import described, second_opinion
 from compensator.service.transfer.two_models import Comparison, ComparisonState, changed
 from tests.audit.made import CONFIG
-from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
+from tests.service.living import MACHINE, Machine, largest_step, settings
 from tests.service.probed import PROBED, ProbedMachine
 from tests.service.records import sample
 from tests.service.simulated import START_NS
@@ -117,7 +117,6 @@ async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by
     # What was foreseen of the offset is what it does.
     assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], rel=0.02)
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
-    assert check_files(machine) == len(machine.outcomes)
     audited = audit(recordings(machine.recordings, MACHINE))
     assert audited.clean and audited.samples == len(machine.outcomes)
 
@@ -154,9 +153,9 @@ async def test_an_hour_of_measured_y_does_not_judge(tmp_path: Path) -> None:
 
 async def test_only_the_last_day_counts(tmp_path: Path) -> None:
     """Y was wrong the day before, and the service was stopped between."""
-    machine = Measured(tmp_path, lambda sample: 0.2 * sample if sample < 600 else 0.0)
-    await machine.run(600)
-    machine.at_sample[640] = functools.partial(machine.command, "zero", b'{"mode": "warm"}')
+    machine = Measured(tmp_path, lambda sample: 0.2 * sample if sample < 240 else 0.0)
+    await machine.run(240)
+    machine.at_sample[280] = functools.partial(machine.command, "zero", b'{"mode": "warm"}')
     await machine.run(HOURS_24 + 60)
     found = machine.opinion(QUILL, gain(0.1))
     assert found.verdict == "worse" and found.present_rms_um < 1.0 and found.hours == pytest.approx(24.0, abs=0.1)
@@ -180,8 +179,8 @@ def test_both_models_are_judged_alike(day: Measured) -> None:
 @pytest.mark.parametrize(
     "more",
     [
-        lambda sample: -30.0 * (sample > 500),
-        lambda sample: 25.0 * (sample > 250) - 25.0 * (sample > 700),
+        lambda sample: -30.0 * (sample > 400),
+        lambda sample: 25.0 * (sample > 200) - 25.0 * (sample > 550),
         lambda sample: -0.05 * sample,
     ],
     ids=["step", "twice", "creep"],
@@ -189,7 +188,7 @@ def test_both_models_are_judged_alike(day: Measured) -> None:
 async def test_a_sensor_that_was_moved_refuses_no_better_model(tmp_path: Path, more: Callable[[int], float]) -> None:
     """By its values Y would speak for the weaker model; by its changes it speaks for the right one."""
     machine = Measured(tmp_path, more)
-    await machine.run(900)
+    await machine.run(700)
     odd = []
     for other in (gain(0.1), gain(-0.1)):
         assert machine.opinion(other, QUILL).verdict == "better"
@@ -227,7 +226,7 @@ async def test_a_dead_sensor_judges_no_model(tmp_path: Path, noise_um: float) ->
     machine = Measured(tmp_path, config=msgspec.structs.replace(settings(), channel=channels))
     rng = np.random.default_rng(4)
     machine.device.sources[2] = lambda: 5.0 + noise_um * float(rng.normal())
-    await machine.run(900)
+    await machine.run(700)
     for change in (0.4, -0.4):
         found = machine.opinion(QUILL, gain(change))
         assert (found.verdict, found.why) == ("not_judged", "unrelated")
@@ -254,12 +253,12 @@ async def test_temperatures_that_measured_y_has_shown_to_be_right_keep_no_model_
     t_q = machine.device.sources[0]
     fallen_k = functools.partial(np.interp, xp=[400, 460, 600, 660], fp=[0.0, 20.0, 20.0, 0.0])
     machine.device.sources[0] = lambda: t_q() - float(fallen_k(len(machine.outcomes)))
-    await machine.run(1300)
+    await machine.run(1100)
     waits = ["t_q_at_exchanged" in outcome.offset.reasons for outcome in machine.outcomes]
     assert any(waits[400:600]) and not any(waits[800:])
     # The six hours before that, and all after it.
     found = machine.opinion(QUILL, gain(-0.8))
-    assert found.verdict == "worse" and found.samples > 400 + 500
+    assert found.verdict == "worse" and found.samples > 400 + 300
 
 
 async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
@@ -286,7 +285,6 @@ async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
     assert taken.answer["ok"] and taken.answer["comparison"]["verdict"] in ("alike", "better")
     # Otherwise the corrected deformation stays as it is at the exchange, and that is foreseen.
     assert abs(taken.answer["comparison"]["offset_change_um"]) < 0.05
-    assert check_files(machine) == len(machine.outcomes)
     audited = audit(recordings(machine.recordings, MACHINE))
     assert audited.clean and audited.samples == len(machine.outcomes)
 
