@@ -206,7 +206,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkey
                     await Bridge(opcua, receiver, said.append).run(asyncio.Event())
 
 
-@pytest.mark.parametrize(("kind", "last"), [("Byte", 255), ("Int16", 32767), ("UInt16", 32767)])
+@pytest.mark.parametrize(("kind", "last"), [("Byte", 255), ("Int16", 32767)])
 async def test_the_heartbeat_begins_again_before_its_node_is_full(tmp_path: Path, kind: str, last: int) -> None:
     said: list[str] = []
     async with (
@@ -293,12 +293,9 @@ def test_a_file_that_cannot_be_read_is_refused_before_the_start(
     assert f"opcua.{key} = 'junk': " in refused(written(tmp_path, retry_s=f"{more}retry_s"), capsys)
 
 
-@pytest.mark.parametrize("error", [AssertionError(), struct.error("unpack"), IndexError("x"), TypeError("y")])
-async def test_no_answer_of_a_server_ends_the_bridge(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+async def test_no_answer_of_a_server_ends_the_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What asyncua raises on an answer that it cannot read may be anything; also while it connects."""
-    left = [error, error]
+    left: list[Exception] = [AssertionError(), struct.error("unpack"), IndexError("x"), TypeError("y")]
     connect = Client.connect
 
     async def breaks(client: Client) -> None:
