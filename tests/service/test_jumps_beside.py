@@ -437,19 +437,20 @@ def drawn_steps(seed: int) -> tuple[Change, Callable[[int, Compensation], None]]
 def test_whatever_happens_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray], seed: int) -> None:
     conf = settings()
     whole, (change, act) = Compensation(conf, QUILL), drawn_steps(seed)
-    last = math.nan
+    last, state = math.nan, whole.state()
     for i in range(260):
         values = readings(day, 200 + i)
         change(i, values)
         if seed % 2:
             values["y_um"] = math.nan
         restored = Compensation(conf, QUILL)
-        restored.restore(whole.state())
+        restored.restore(state)
         act(i, whole)
         act(i, restored)
         outcome, again = whole.process(sample(i, values)), restored.process(sample(i, values))
         assert encode(again.offset) == encode(outcome.offset) and again.notes == outcome.notes, i
-        assert restored.state() == whole.state(), i
+        state = whole.state()
+        assert restored.state() == state, i
         offset = number(outcome.offset.y_offset_um)
         assert not abs(offset - last) > 20.0 + 1e-9
         last = offset

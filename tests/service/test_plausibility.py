@@ -400,19 +400,21 @@ def test_the_state_goes_on_to_the_bit_and_old_states_are_taken(day: dict[str, np
     rest = {"channel": "heat_w", "at_most": 1.0, "after_min": 10.0, "t_q_at_max_k": 0.1}
     conf = checked(rest=rest)
     whole = Compensation(conf, QUILL)
+    state = whole.state()
     for i in range(360):
         values = {channel["name"]: float(day[channel["name"]][i]) for channel in CHANNELS}
         drift(i, values)
         restored = Compensation(conf, QUILL)
-        restored.restore(whole.state())
+        restored.restore(state)
         if i == 280:
             for one in (whole, restored):
                 one.pause(33)
         outcome, again = whole.process(sample(i, values)), restored.process(sample(i, values))
         assert encode(again.offset) == encode(outcome.offset) and again.notes == outcome.notes
-        assert restored.state() == whole.state()
+        state = whole.state()
+        assert restored.state() == state
     assert whole.plausibility.reasons
-    old = json.loads(whole.state())
+    old = json.loads(state)
     del old["plausibility"]
     restored.restore(json.dumps(old).encode())
     assert restored.plausibility.reasons == []

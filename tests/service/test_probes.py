@@ -45,7 +45,7 @@ from compensator.service.transfer.shadow import Shadow
 from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
-from tests.service.living import MACHINE, check_files, largest_step
+from tests.service.living import MACHINE, largest_step
 from tests.service.looping import machine as loop_machine
 from tests.service.looping import settings as loop_settings
 from tests.service.looping import stronger
@@ -82,7 +82,7 @@ async def test_hourly_probes_take_a_gain_error_away(tmp_path: Path) -> None:
     assert after < 0.2 * before
     assert set(probed.codes()) == {"taken"} and len(probed.codes()) == 17
     assert all(reply.result()["ok"] for reply in probed.replies)
-    assert nothing_jumped(probed) and check_files(probed) == 1080
+    assert nothing_jumped(probed) and len(probed.outcomes) == 1080
     std = np.array([number(outcome.offset.y_offset_std_um) for outcome in probed.outcomes])[300:]
     # The device has no noise, which the stated deviation allows for.
     assert 0.25 < np.sqrt(np.mean((probed.left_um()[300:] / std) ** 2)) < 1.3
@@ -493,7 +493,8 @@ async def test_a_kill_between_probes_loses_nothing(tmp_path: Path, torn: int) ->
     await machine.run(100)
     assert machine.codes() == ["taken"] * 5 and largest_step(machine.outcomes) <= RATE_UM + 1e-9
     assert wanted_because(machine) != ProbeCode.FIRST
-    assert look(machine).clean and check_files(machine) == 350 - bool(torn) + bool(torn)
+    audited = look(machine)
+    assert audited.clean and audited.samples == 350
 
 
 async def test_probes_of_before_and_of_during_a_restart(tmp_path: Path) -> None:
@@ -591,7 +592,7 @@ async def test_another_model_goes_on_with_the_correction(tmp_path: Path) -> None
     assert abs(number(after.y_offset_um) - number(before.y_offset_um)) < 2.0
     assert number(after.y_offset_std_um) < 1.5 * number(before.y_offset_std_um)
     assert set(machine.codes()) == {"taken"} and nothing_jumped(machine)
-    assert check_files(machine) == 890
+    assert len(machine.outcomes) == 890
     left = machine.left_um()
     assert np.sqrt(np.mean(left[at:] ** 2)) < 2.5
 
