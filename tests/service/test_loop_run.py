@@ -68,7 +68,7 @@ def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> No
 def test_a_candidate_that_is_worse_is_never_adopted() -> None:
     """The diagnosis has found the coolant, and today it does not act."""
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    steps = run(loop, evening(NIGHT + DAY, acts=lambda i: float(i < NIGHT)))
+    steps = run(loop, evening(NIGHT + 18 * 60, acts=lambda i: float(i < NIGHT)))
     found = [decision[1:] for decision in decisions(steps)]
     assert ("end", "worse") in found and "adopt" not in [step for step, _ in found]
     assert loop.effects == ()
@@ -203,7 +203,7 @@ def test_a_creeping_mount_does_not_make_a_better_model() -> None:
     """From the night on Y creeps by 1 µm/h; the candidate explains it by the coolant, which does not act."""
     creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended(1.0))))
-    steps = run(loop, evening(NIGHT + DAY, acts=lambda i: 0.0, more=creep))
+    steps = run(loop, evening(NIGHT + 14 * 60, acts=lambda i: 0.0, more=creep))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
@@ -241,7 +241,7 @@ def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
             values["coolant_degc"] = math.nan
 
     loop = OfflineLoop(settings(), QUILL, Night(shown(extended())))
-    steps = run(loop, evening(NIGHT + DAY, change=missing))
+    steps = run(loop, evening(NIGHT + 18 * 60, change=missing))
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
     last = [one for step in steps for one in step.candidates][-1]
     assert last.hours <= 1.0 and "channel_missing:coolant_degc" in last.reasons
