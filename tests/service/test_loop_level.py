@@ -116,6 +116,13 @@ def test_a_mount_that_slips_beside_an_effect_that_acts_is_no_level_of_it(slip_mi
     assert abs(np.mean(error)) < 4.0
 
 
+def test_a_slip_that_is_seen_some_blocks_late_is_no_level_either():
+    """Three of its blocks were among those before, in which the candidate then was the worse one: 8 µm in `ok`."""
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
+    steps = run(loop, from_noon(NIGHT + 13 * 60, more=lambda i: 8.0 * (i >= 7 * 60)))
+    assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
+
+
 def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     samples = from_noon(NIGHT + 25 * 60, begun, more=crept, change=warm_at_first)

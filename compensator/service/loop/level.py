@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from compensator.arrays import rms_of
+from compensator.arrays import Vector, rms_of
 from compensator.diagnose.change import BLOCK_MIN, FEWEST_BLOCKS, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
@@ -132,6 +132,8 @@ def level_um(
     6.0
     >>> level_um(began, [(n, 0.1 if n < 12 else 6.0) for n in range(40)]) is None  # the effect acted before: a slip
     True
+    >>> level_um(began, [(n, 0.1 if n < 10 else 6.0) for n in range(40)]) is None  # one that is seen some blocks late
+    True
     >>> level_um(began, [(n, 6.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
     True
     >>> level_um(began, [(n, 0.8 * (n % 2) if n < 12 else 6.5) for n in range(40)]) is None  # it moves Y by 2 µm only
@@ -150,11 +152,18 @@ def level_um(
     if np.sum(compared) < FEWEST_BLOCKS:
         return None
     left_um, error_um = rest[compared], rms_of(own[compared])
-    was_right = rms_of(own[~since]) < QUIET * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
+    own_before, rest_before = own[~since], rest[~since]
+    was_right = rms_of(own_before) < QUIET * error_um and np.std(own_before) < RIGHTER * np.std(rest_before)
+    # The time may be found some blocks after a slip, which is then among those before.
+    was_right = was_right and _spread(rest_before) >= QUIET * _spread(own_before)
     # Medians: while the effect begins, its lag is seen.
-    middle_um = float(np.median(left_um))
+    middle_um, spread_um = float(np.median(left_um)), _spread(left_um)
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
-    spread_um = float(np.median(np.abs(left_um - middle_um)))
     stays = abs(halves[1] - halves[0]) < STAYS * error_um and spread_um < SPREAD * error_um
     moves = abs(middle_um) <= _MOST * np.ptp(own - rest)
     return middle_um if was_right and stays and moves else None
+
+
+def _spread(values: Vector) -> float:
+    """Return the median of how far values are from their median."""
+    return float(np.median(np.abs(values - np.median(values))))
