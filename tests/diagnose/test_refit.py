@@ -73,23 +73,52 @@ def model(runs):
 
 @pytest.fixture(scope="module")
 def searches():
-    """What the searches of the one diagnosis gave, in their order, by what was called."""
-    return {"findings_of": [], "held_out_of": []}
+    """What the searches of the runs gave, by what was called and whether the paths were free."""
+    return {}
+
+
+def searched_once(patch, searches):
+    """Let diagnoses of the runs search once with free paths and once with those of the model."""
+
+    def once(name, is_free):
+        real = getattr(diagnosis_module, name)
+
+        def called(first, *others):
+            asked = name, is_free(first)
+            if asked not in searches:
+                searches[asked] = real(first, *others)
+            return searches[asked]
+
+        return called
+
+    patch.setattr(diagnosis_module, "findings_of", once("findings_of", lambda evidence: evidence.free_paths))
+    patch.setattr(diagnosis_module, "held_out_of", once("held_out_of", lambda found: found.search.evidence.free_paths))
 
 
 @pytest.fixture(scope="module")
 def found(model, runs, searches):
-    def keeping(original, results):
-        def called(*arguments):
-            results.append(original(*arguments))
-            return results[-1]
-
-        return called
-
     with pytest.MonkeyPatch.context() as patch:
-        for name, results in searches.items():
-            patch.setattr(diagnosis_module, name, keeping(getattr(diagnosis_module, name), results))
+        searched_once(patch, searches)
         return diagnose(model, runs)
+
+
+@pytest.fixture(scope="module")
+def kept(model, runs, searches):
+    with pytest.MonkeyPatch.context() as patch:
+        searched_once(patch, searches)
+        return diagnose(model, runs, DiagnosisOptions(keep_paths=True))
+
+
+@pytest.fixture
+def foretold(searches, found, kept, monkeypatch):
+    """Let paths that are fitted anew leave other errors on held-out blocks: a function that is called with them."""
+    searched_once(monkeypatch, searches)
+    errors = searches["held_out_of", True]
+
+    def change(**changed):
+        monkeypatch.setitem(searches, ("held_out_of", True), dataclasses.replace(errors, **changed))
+
+    return change
 
 
 def test_the_channel_and_its_curve_are_named(found):
@@ -117,8 +146,7 @@ def test_the_extended_model_says_what_error_it_has_left(found):
     assert any("were refitted" in str(words) for words in found.warnings)
 
 
-def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(model, runs, found):
-    kept = diagnose(model, runs, DiagnosisOptions(keep_paths=True))
+def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(model, runs, found, kept):
     assert (kept.model.dtf, kept.model.tdtf) == (model.dtf, model.tdtf) and found.model.dtf != model.dtf
     assert [e.place for e in kept.effects][:1] == [("input", "", "spindle_rpm")]
     codes = [one.code for one in kept.warnings]
@@ -137,26 +165,16 @@ def test_paths_that_are_to_be_kept_are_kept_and_that_they_miss_much_is_said(mode
     [(0.3, 0.6, True), (0.3, 0.9, False), (0.8, 0.95, True), (0.8, 1.05, False), (1.1, 1.05, True)],
 )
 def test_paths_that_foretell_nothing_of_held_out_blocks_are_kept(
-    model, runs, found, searches, monkeypatch, nothing, whole, deployed
+    model, runs, found, searches, foretold, nothing, whole, deployed
 ):
     """Each block knows less of new paths than the whole, but not three times less, nor less than no compensation.
 
     Both errors are shares of the spread of Y, which no compensation leaves.
     """
     assert found.model.effects
-    (errors,), real = searches["held_out_of"], (diagnosis_module.findings_of, diagnosis_module.held_out_of)
-    scale = found.evidence.spread_um / rms_of(errors.nothing)
-    before, after = nothing * scale * errors.nothing, whole * scale * errors.nothing
-    worse = dataclasses.replace(errors, nothing=before, named=after, whole=after)
-
-    def findings_of(evidence):
-        return searches["findings_of"][0] if evidence.free_paths else real[0](evidence)
-
-    def held_out_of(searched, *rest):
-        return worse if searched.search.evidence.free_paths else real[1](searched, *rest)
-
-    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
-    monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
+    left = searches["held_out_of", True].nothing
+    scale = found.evidence.spread_um / rms_of(left)
+    foretold(nothing=nothing * scale * left, named=whole * scale * left, whole=whole * scale * left)
     again = diagnose(model, runs)
     assert (again.model.dtf != model.dtf) is deployed and again.model.effects
     assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is not deployed
@@ -164,7 +182,7 @@ def test_paths_that_foretell_nothing_of_held_out_blocks_are_kept(
 
 @pytest.mark.usefixtures("found")
 def test_beside_paths_that_were_fitted_anew_the_remainder_has_no_limit(model, searches):
-    searched = searches["findings_of"][0]
+    searched = searches["findings_of", True]
     searched = dataclasses.replace(searched, remainder=searched.channels)
     for refitted, is_limited in ((searched.refitted, False), (None, True)):
         extended, _ = with_effects(model, dataclasses.replace(searched, refitted=refitted), ())
@@ -172,34 +190,13 @@ def test_beside_paths_that_were_fitted_anew_the_remainder_has_no_limit(model, se
         assert rest.kind == "regression" and np.isfinite(rest.most_um) == is_limited
 
 
-@pytest.mark.usefixtures("found")
 def test_paths_of_a_calibration_on_other_data_stay_unless_others_foretell_clearly_better(
-    model, runs, searches, monkeypatch
+    model, runs, searches, kept, foretold
 ):
     """Fitted anew to few hours, paths may explain these and no other day; the calibration knows more."""
-    anew, kept = ({name: found[0] for name, found in searches.items()}, {})
-    real = {name: getattr(diagnosis_module, name) for name in anew}
-
-    def findings_of(evidence):
-        if evidence.free_paths:
-            return anew["findings_of"]
-        if "findings_of" not in kept:
-            kept["findings_of"] = real["findings_of"](evidence)
-        return kept["findings_of"]
-
-    def held_out_of(found, *rest):
-        if found.search.evidence.free_paths:
-            return foretold
-        if "held_out_of" not in kept:
-            kept["held_out_of"] = real["held_out_of"](found, *rest)
-        return kept["held_out_of"]
-
-    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
-    monkeypatch.setattr(diagnosis_module, "held_out_of", held_out_of)
-    kept_um = diagnose(model, runs, DiagnosisOptions(keep_paths=True)).after.rms_um
+    whole = searches["held_out_of", True].whole
     for share, stay in ((0.7, False), (0.8, True)):
-        whole = anew["held_out_of"].whole
-        foretold = dataclasses.replace(anew["held_out_of"], whole=share * kept_um / rms_of(whole) * whole)
+        foretold(whole=share * kept.after.rms_um / rms_of(whole) * whole)
         reported = []
         options = DiagnosisOptions(unseen=True)
         again = diagnose(model, runs, options, progress=lambda *steps, reported=reported: reported.append(steps))
@@ -210,8 +207,9 @@ def test_paths_of_a_calibration_on_other_data_stay_unless_others_foretell_clearl
 
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(model, found, runs):
     silent = dataclasses.replace(model, provenance={})
-    again = diagnose(silent, runs)
-    assert [e.term.hypothesis for e in again.effects] == [e.term.hypothesis for e in found.effects]
+    again = findings_of(diagnosis_module._evidence(silent, runs))
+    assert [term.hypothesis for term in again.terms] == [e.term.hypothesis for e in found.effects]
+    assert again.refitted is not None and again.deploys_names and found.model.dtf != model.dtf
 
 
 def test_what_is_not_logged_is_not_made_up(runs):
@@ -225,10 +223,11 @@ def test_what_is_not_logged_is_not_made_up(runs):
     assert all(e.place[2] != "second_um" for e in result.effects)
 
 
-def test_the_paths_are_what_the_regression_says(model, runs):
+@pytest.mark.usefixtures("found")
+def test_the_paths_are_what_the_regression_says(model, searches):
     """The filter banks of heat and ambient, written as transfer functions, give the same deformation."""
-    evidence = evidence_of(model, runs).with_free_paths()
-    found = findings_of(evidence)
+    found = searches["findings_of", True]
+    evidence = found.search.evidence
     extended, rest = with_paths(model, found.refitted.effect)
     record = evidence.signals[0]
     y = extended.dtf.sampled.response(record.drive) + extended.tdtf.sampled.response(record.ambient_k)
