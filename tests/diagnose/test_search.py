@@ -30,6 +30,11 @@ QUILL = load_model("quill")
 DEPLOYED, NOT_DEPLOYED = ("input", "gain TDTF", "missing mode", "play"), ("drift", "step", "periodic", "unobserved")
 
 
+def logged(columns):
+    """Columns for a diagnosis to the end: each further channel is searched four times. Searches alone have them all."""
+    return {name: columns[name] for name in ("t_q_degc", "at_degc", "y_um", "coolant_degc", "spindle_rpm")}
+
+
 def search(scenarios, seed, hours=24.0, **noise):
     columns, _, _ = record(scenarios, seed, hours, **noise)
     return Search(evidence_of(QUILL, runs_from(columns))).run().fit.terms
@@ -76,7 +81,7 @@ def test_nothing_is_added_to_data_without_an_effect(seed):
 def test_the_extended_model_removes_the_error_on_a_fresh_day(kind):
     scenario = draw(kind, 7)
     columns, _, _ = record([scenario], 1007, 18.0)
-    diagnosis = diagnose(QUILL, runs_from(columns))
+    diagnosis = diagnose(QUILL, runs_from(logged(columns)))
     assert [e.place for e in diagnosis.effects] == [scenario.place]
     fresh, true, effect = record([scenario], 5007, 24.0)
     run = runs_from(fresh)[0]
@@ -96,7 +101,7 @@ def test_the_extended_model_removes_the_error_on_a_fresh_day(kind):
 def test_what_cannot_be_deployed_is_explained_and_left_out(kind):
     scenario = draw(kind, 8)
     columns, _, _ = record([scenario], 1008, 18.0)
-    diagnosis = diagnose(QUILL, runs_from(columns))
+    diagnosis = diagnose(QUILL, runs_from(logged(columns)))
     assert [e.place for e in diagnosis.effects] == [scenario.place]
     assert not diagnosis.effects[0].deployable
     assert diagnosis.model.effects == ()

@@ -9,8 +9,9 @@ import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.record import SampledRecord
 from compensator.diagnose.base_run import context_of
-from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
+from compensator.diagnose.initial_state import as_begun
 from compensator.diagnose.search import Search
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import COOLEST, EQUAL, proposals
@@ -36,8 +37,8 @@ def warm(kind, *, size_um=6.0, hours=24.0):
 
 @functools.cache
 def diagnosed(kind):
-    """What is found in its first 16 h."""
-    columns = warm(kind)[1]
+    """What is found in its first 16 h, with the channel that acts and another one."""
+    columns = {name: warm(kind)[1][name] for name in ("t_q_degc", "at_degc", "y_um", "fan_rpm", "coolant_degc")}
     return tc.diagnose("quill", {"t_s": 60.0 * np.arange(columns["y_um"].size), **columns}, fit_until_h=16.0)
 
 
@@ -103,7 +104,8 @@ def test_after_a_long_gap_an_effect_counts_from_the_start_before_it():
     runs = runs_from(columns)
     assert len(runs) == 2
     assert not evidence_of(QUILL, runs).context.begins_warm
-    assert [effect.place for effect in diagnose(QUILL, runs).effects] == [scenario.place]
+    found = findings_of(evidence_of(QUILL, runs))
+    assert [term.hypothesis.place for term in as_begun(found, findings_of).terms] == [scenario.place]
 
 
 def test_a_record_that_begins_at_rest_has_no_further_hypotheses():
