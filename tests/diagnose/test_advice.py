@@ -56,7 +56,9 @@ def door():
     sizes = np.random.default_rng(3).uniform(3.0, 6.0, times.size) * (-1.0) ** np.arange(times.size)
     for at, size in zip(times.tolist(), np.cumsum(sizes).tolist(), strict=True):
         levels[at:] = size
-    return times, diagnose(QUILL, runs_from(machine(lambda s: lag(levels, 12.0), 31)))
+    columns = machine(lambda s: lag(levels, 12.0), 31)
+    logged = ("t_q_degc", "at_degc", "y_um", "coolant_flow_lpm", "spindle_rpm", "fan_rpm")
+    return times, diagnose(QUILL, runs_from({name: columns[name] for name in logged}))
 
 
 def test_an_unobserved_source_is_tied_to_the_event_it_goes_with(door):
@@ -218,6 +220,8 @@ def twins():
     columns["cabinet_degc"] = (
         22.0 + 0.8 * (columns["coolant_degc"] - 20.0) + rng.normal(0.0, 0.02, columns["y_um"].size)
     )
+    logged = ("t_q_degc", "at_degc", "y_um", "coolant_degc", "cabinet_degc", "fan_rpm")
+    columns = {name: columns[name] for name in logged}
     return columns, diagnose(QUILL, runs_from(columns))
 
 
