@@ -50,7 +50,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(folder / "run.csv", CALIBRATION_W, 1)
     write_run(folder / "other.csv", VALIDATION_W, 2)
     columns, _, _ = record([draw("input", 4)], 79, 10.0)
-    write_table(folder / "effect.csv", {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
+    logged = {name: columns[name] for name in ("t_q_degc", "at_degc", "y_um", "spindle_rpm", "coolant_degc")}
+    write_table(folder / "effect.csv", {"t_s": np.arange(columns["y_um"].size) * 60.0, **logged})
     return folder
 
 
