@@ -170,7 +170,7 @@ def test_how_fast_the_heat_moves_is_learned_with_a_late_t_q() -> None:
 
 
 def test_no_dead_time_is_none() -> None:
-    """The search of a lag and a dead time stays a little inside its bounds."""
+    """The search of a lag and a dead time ends at the bound, where there is none."""
     columns, _, _ = record([sensor(6.0, 0.0)], 1107, 36.0)
     evidence = evidence_of(QUILL, runs_from(columns))
     both = next(h for h in proposals(evidence.context) if h.place == PLACE and h.form == "path, dead time and lag")

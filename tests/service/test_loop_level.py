@@ -139,6 +139,18 @@ def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it
     assert np.std(after) < 0.5 * np.std(before)
 
 
+def test_what_moved_y_before_a_zero_moves_nothing_about_it():
+    """A diagnosis says that a mount was knocked; a zero takes that away, and Y shows the level again."""
+    knocked = dataclasses.replace(shown(extended()), y_moved_utc_ns=LATER_NS)
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(knocked))
+    samples = evening(5 * 60)
+    run(loop, samples, 4 * 60 + 10)
+    assert loop._core.state.y_moved_ns > 0
+    loop.compensation.zero("warm")
+    run(loop, samples, 2)
+    assert loop._core.state.y_moved_ns == 0
+
+
 def test_such_a_candidate_is_adopted_after_a_zero():
     loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(extended())))
     samples = from_noon(NIGHT + 35 * 60, begun, more=crept, change=warm_at_first)
