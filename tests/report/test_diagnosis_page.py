@@ -151,7 +151,8 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
     residual = np.where(evidence.used, large + small, 0.0)
     evidence = dataclasses.replace(evidence, residual=residual)
     places = [("gain", "DTF", ""), ("input", "", "coolant_degc")]
-    terms = [SimpleNamespace(hypothesis=SimpleNamespace(place=place), effect=QUILL) for place in places]
+    seen_by_all = SimpleNamespace(observed=True)
+    terms = [SimpleNamespace(hypothesis=SimpleNamespace(place=place), effect=seen_by_all) for place in places]
     nothing = np.zeros(evidence.used.size)
 
     def findings_of(seen: Any, **_: Any) -> Any:
@@ -176,8 +177,9 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
     all_of = SimpleNamespace(
         search=search,
         selection=SimpleNamespace(fit=fit, before=fit),
-        terms=(),
-        responses=(),
+        terms=terms,
+        responses=(large, small),
+        remainder=None,
         deploys_names=True,
         foresight=None,
         left_in=None,
