@@ -154,8 +154,7 @@ class Criterion:
         if approximate and not others and removed_um2 < effect.removes_alone * without_um2:
             return False
         share = effect.worth_with_others if approximate and others else effect.worth
-        added = np.where(self._evidence.used, response(self._evidence, term), 0.0)
-        size = float(np.sum(self._evidence.without_nuisances(added) ** 2))
+        size = float(np.sum(self._added(term) ** 2))
         return size > share * (without_um2 * self._evidence.count + self._evidence.noise.allowance)
 
     def is_plausible(self, terms: Sequence[Term]) -> bool:
@@ -175,6 +174,10 @@ class Criterion:
         return bool(np.max(np.linalg.norm(table, axis=0)) >= CANCELS * np.linalg.norm(table.sum(axis=1)))
 
     def _make_up(self, terms: Sequence[Term]) -> bool:
-        evidence = self._evidence
-        each = [evidence.without_nuisances(np.where(evidence.used, response(evidence, term), 0.0)) for term in terms]
+        each = [self._added(term) for term in terms]
         return bool(max(map(np.linalg.norm, each)) > MAKES_UP * np.linalg.norm(sum(each)))
+
+    def _added(self, term: Term) -> Vector:
+        """Return what an effect adds on every sample, nuisances projected out, µm; 0 where samples are not used."""
+        added = np.where(self._evidence.used, response(self._evidence, term), 0.0)
+        return self._evidence.without_nuisances(added)
