@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import re
 import shutil
 import socket
@@ -27,6 +26,7 @@ from compensator.watch.clients import CONNECTIONS
 from compensator.watch.history import MachineHistory
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
+from tests.report import chromium
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
 from tests.watch.slow import drip
 
@@ -198,31 +198,9 @@ def test_a_port_that_is_taken_is_one_line(server: PageServer) -> None:
 def drawn(
     address: str, folder: Path, width: int, zone: str = "UTC", scheme: int = 1, budget_ms: int = 4000
 ) -> tuple[str, str]:
-    """Return the page as a browser has it, and what its console said."""
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    if browser is None:
-        pytest.skip("chromium is not installed")
-    done = subprocess.run(
-        [
-            browser,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            f"--user-data-dir={folder / 'profile'}",
-            "--dump-dom",
-            f"--window-size={width},900",
-            f"--blink-settings=preferredColorScheme={scheme}",
-            f"--virtual-time-budget={budget_ms}",
-            "--enable-logging=stderr",
-            address,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=True,
-        env={**os.environ, "TZ": zone},
-    )
-    return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+    """Return the page in a window of some width, and what its console said."""
+    options = f"--window-size={width},900", f"--blink-settings=preferredColorScheme={scheme}"
+    return chromium.drawn(address, folder, *options, budget_ms=budget_ms, zone=zone)
 
 
 def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServer, tmp_path: Path) -> None:
