@@ -206,7 +206,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path, monkey
                     await Bridge(opcua, receiver, said.append).run(asyncio.Event())
 
 
-@pytest.mark.parametrize(("kind", "last"), [("Byte", 255), ("Int16", 32767)])
+@pytest.mark.parametrize(("kind", "last"), [("Byte", 255), ("Int16", 32767), ("UInt16", 32767)])
 async def test_the_heartbeat_begins_again_before_its_node_is_full(tmp_path: Path, kind: str, last: int) -> None:
     said: list[str] = []
     async with (
