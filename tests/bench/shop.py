@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +34,7 @@ from compensator.watch.listener import Listener, of_endpoints
 from compensator.watch.shop import Shop
 from compensator.watch.shop_recorder import ShopRecorder
 from tests.bench.figures import Figure, told
+from tests.ports import free_port
 
 MACHINES, PROCESSES = 200, 4
 #: Messages of one sample of one machine.
@@ -291,9 +291,7 @@ def measure(
     samples, machines, processes : int
         How many samples of how many machines in how many processes.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     each, sent = machines // processes, machines * samples * len(KINDS)
     with ExitStack() as stack:
         router, _, out = stack.enter_context(started("route", port))

@@ -25,9 +25,10 @@ from compensator.receiver.limits import Acceptance
 from tests.bridge.plc import Plc
 from tests.bridge.test_opcua import Clock, refused, until
 from tests.fuzz.mutation import mutated
+from tests.ports import free_port
 from tests.receiver.limits import MAX_UM, plain, sloped
 from tests.receiver.offsets import MACHINE, axis_offset, slope
-from tests.receiver.wire import ScriptedService, free_port, router
+from tests.receiver.wire import ScriptedService, router
 
 CYCLE_S, RATE_UM_PER_S = 0.05, 100.0
 FILE = """

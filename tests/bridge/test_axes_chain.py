@@ -10,7 +10,8 @@ from pathlib import Path
 from tests.bridge.plc import Plc
 from tests.bridge.test_axes import bridging, written
 from tests.bridge.test_opcua import until
-from tests.receiver.wire import free_port, router
+from tests.ports import free_port
+from tests.receiver.wire import router
 from tests.soak.axes_site import FREE, PERIOD_S, RATES, Axes, AxesSite, levers
 from tests.soak.site import end
 

@@ -28,7 +28,8 @@ from compensator.errors import ConfigError
 from compensator.receiver import Receiver, Settings
 from compensator.receiver.applied_record import applied_at
 from tests.bridge.plc import Plc
-from tests.receiver.wire import ScriptedService, free_port, router
+from tests.ports import free_port
+from tests.receiver.wire import ScriptedService, router
 
 CYCLE_S, RATE_UM_PER_S = 0.05, 100.0
 #: Largest step of the value: what the rate allows in two cycles.

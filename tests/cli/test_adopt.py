@@ -24,18 +24,11 @@ from compensator.service.presence import sole_user
 from compensator.service.transfer.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_commands import load_fast_model
+from tests.ports import free_port
 from tests.service.living import Machine
 
 LINES = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 10001, "command": 10023}
 PREFIX = "shop/sim"
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def stronger(folder: Path, base: Path, change: float = 0.3) -> Path:

@@ -7,7 +7,6 @@ import csv
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +26,7 @@ from compensator.errors import UsageError
 from compensator.model.model_file import load_model
 from compensator.recording.reading import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from tests.ports import free_port
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +89,8 @@ def test_check_and_run_on_hardware_with_sigterm(tmp_path: Path) -> None:
     """The service as a process of its own, in real time, ended by SIGTERM with a finished recording."""
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    with hardware(world) as (lines, _capa, _), socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-        free.close()
+    with hardware(world) as (lines, _capa, _):
+        port = free_port()
         config = tmp_path / "machine.toml"
         fast = load_fast_model(tmp_path)
         text = configuration("vmc-07", lines, port).replace('file = "quill"', f'file = "{fast.name}"')

@@ -19,7 +19,7 @@ from compensator.probes.settings import Service
 from compensator.service import presence
 from compensator.service.presence import is_used, sole_user
 from compensator.service.publisher import Publisher
-from tests.receiver.wire import free_port
+from tests.ports import free_port
 
 
 def operator(folder: Path, port: int) -> str:

@@ -11,7 +11,8 @@ import pytest
 
 from compensator.cli import main as cli_main
 from compensator.commands import Answer
-from tests.receiver.wire import free_port, router, until
+from tests.ports import free_port
+from tests.receiver.wire import router, until
 
 ROOT = Path(__file__).parents[2]
 #: Starts a program as a script's background does, and worse.

@@ -21,8 +21,9 @@ from compensator.demo.machine import configuration, hardware
 from compensator.watch.listener import of_endpoints
 from compensator.watch.shop import Shop
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-from tests.cli.test_adopt import Receiver, free_port, service
+from tests.cli.test_adopt import Receiver, service
 from tests.cli.test_commands import load_fast_model
+from tests.ports import free_port
 from tests.watch.heard import offset
 
 

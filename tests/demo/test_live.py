@@ -31,7 +31,7 @@ from compensator.service.loading import load
 from compensator.service.publisher import Publisher
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import Faults
-from tests.cli.test_adopt import free_port
+from tests.ports import free_port
 
 QUILL = Path(__file__).parents[2] / "compensator/model/quill.toml"
 #: How often a device is asked that must answer.

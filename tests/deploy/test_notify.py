@@ -29,8 +29,9 @@ from compensator.recording.reading import recordings
 from compensator.service import systemd
 from compensator.service.compensation import Outcome
 from compensator.service.systemd import ServiceManager
-from tests.cli.test_adopt import LINES, free_port
+from tests.cli.test_adopt import LINES
 from tests.cli.test_commands import load_fast_model
+from tests.ports import free_port
 from tests.service.simulated import Bench
 
 

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ from compensator.demo.day import run_day
 from compensator.messages import SCHEMA, Offset, encode
 from compensator.recording.reading import read_messages, recordings
 from compensator.service.publisher import session_config
+from tests.ports import free_port
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "deploy/examples"
 PREFIX = "shop/vmc-07"
@@ -75,9 +75,7 @@ def test_a_subscriber_prints_what_is_published_and_says_when_to_hold(tmp_path: P
             )
         )
     ]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     with zenoh.open(session_config(Zenoh(prefix=PREFIX, mode="peer", listen=[endpoint]))) as session:
         publisher = session.declare_publisher(f"{PREFIX}/thermal/y/offset")
         matched = threading.Event()

@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sim_hardware.wire import PrintingControl, Rack
+from tests.ports import free_port
 from tests.probes.test_printed import MACRO, VARIABLES
-from tests.receiver.wire import ScriptedService, free_port, router, until
+from tests.receiver.wire import ScriptedService, router, until
 
 FILE = """
 [probes]

@@ -11,7 +11,8 @@ import msgspec
 import pytest
 
 from compensator.messages import ProbeRequest
-from tests.receiver.wire import PREFIX, ScriptedService, free_port, router
+from tests.ports import free_port
+from tests.receiver.wire import PREFIX, ScriptedService, router
 
 PROGRAM = Path(__file__).resolve().parents[2] / "deploy/examples/probe.py"
 

@@ -20,11 +20,12 @@ from compensator.receiver import Receiver
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import PrintingControl, Rack
 from tests.linuxcnc.control import changed
+from tests.ports import free_port
 from tests.probes.helpers import touch_um
 from tests.probes.test_command import bridge
 from tests.probes.test_page import MACROS
 from tests.receiver.test_subscriber import settings
-from tests.receiver.wire import free_port, until
+from tests.receiver.wire import until
 
 PREFIX = "shop/vmc-07"
 #: Without the time of day, whose second is as long as a sample here.

@@ -26,8 +26,9 @@ from compensator.receiver import (
 )
 from compensator.receiver.applied_record import applied_at
 from compensator.receiver.tool_length import ToolLength
+from tests.ports import free_port
 from tests.receiver.offsets import slope
-from tests.receiver.wire import ScriptedService, free_port, router, until
+from tests.receiver.wire import ScriptedService, router, until
 
 ROOT = Path(__file__).parents[2]
 FILE = """

@@ -10,8 +10,9 @@ import pytest
 from compensator.receiver import ProbeWanted, Receiver, Rejected
 from compensator.receiver.applied_record import applied_at
 from compensator.receiver.message import parse_status
+from tests.ports import free_port
 from tests.receiver.test_subscriber import settings
-from tests.receiver.wire import ScriptedService, free_port, router, until
+from tests.receiver.wire import ScriptedService, router, until
 
 WANTED = {"probe_wanted": True, "wanted_by_ns": 17, "wanted_std_um": 2.5, "wanted_tolerance_um": 2.0}
 HOUR_NS = 3_600_000_000_000

@@ -15,8 +15,9 @@ import pytest
 
 from compensator.demo import live
 from compensator.receiver import Receiver, ReceiverError, Settings, load_settings
+from tests.ports import free_port
 from tests.receiver.offsets import MACHINE
-from tests.receiver.wire import PREFIX, ScriptedService, free_port, router, until
+from tests.receiver.wire import PREFIX, ScriptedService, router, until
 
 ROOT = Path(__file__).parents[2]
 

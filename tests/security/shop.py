@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from compensator.receiver import Receiver
 from compensator.receiver.settings import Settings
 from compensator.service.publisher import Publisher, Sender
 from compensator.service.session import read_config_file
+from tests.ports import free_port
 from tests.receiver.offsets import offset
 
 DEPLOY = Path(__file__).parents[2] / "deploy" / "zenoh"
@@ -69,12 +69,6 @@ def wait(done: Callable[[], Any], what: str, timeout_s: float = 30.0) -> Any:
         assert time.monotonic() < end, f"waited in vain for {what}"
         time.sleep(0.005)
     return found
-
-
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def script(name: str, *arguments: str, code: int = 0) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.security.shop import free_port
+from tests.ports import free_port
 from tests.security.test_check import written
 
 LISTENING = "0A"

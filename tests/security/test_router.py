@@ -26,7 +26,8 @@ from compensator.config import Zenoh
 from compensator.service.command_client import operator_of_file
 from compensator.service.publisher import Publisher
 from compensator.service.session import alive_services, client_config, get, read_config_file, tls_files
-from tests.security.shop import DEPLOY, Shop, free_port, script
+from tests.ports import free_port
+from tests.security.shop import DEPLOY, Shop, script
 
 
 def test_the_router_serves_says_who_comes_and_ends_on_sigterm(shop: Shop, tmp_path: Path) -> None:

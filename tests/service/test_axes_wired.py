@@ -22,7 +22,7 @@ from compensator.service.loading import load
 from compensator.service.publisher import Publisher
 from compensator.service.session import session_config
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-from tests.receiver.wire import free_port
+from tests.ports import free_port
 from tests.service.several import AXES, SLOPE, TILT, model_text
 from tests.service.simulated import START_NS
 

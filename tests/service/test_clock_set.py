@@ -20,10 +20,10 @@ from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.audit.made import CONFIG, MACHINE, QUILL
+from tests.ports import free_port
 from tests.receiver.wire import until
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice
 from tests.soak.site import Receiver as Heard
-from tests.soak.site import free_port
 
 RATE_UM_PER_MIN = 8.0
 SAMPLES, FORWARD, BACK = 48, 16, 32

@@ -14,7 +14,8 @@ from compensator.service import presence
 from compensator.service import publisher as publisher_module
 from compensator.service.publisher import Publisher
 from compensator.service.session import session_config
-from tests.receiver.wire import free_port, router
+from tests.ports import free_port
+from tests.receiver.wire import router
 
 LONG_S = 60.0
 

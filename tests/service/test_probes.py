@@ -44,7 +44,7 @@ from compensator.service.state import decode_state
 from compensator.service.transfer.shadow import Shadow
 from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
-from tests.security.shop import free_port
+from tests.ports import free_port
 from tests.service.living import MACHINE, largest_step
 from tests.service.looping import machine as loop_machine
 from tests.service.looping import settings as loop_settings

@@ -20,7 +20,7 @@ from compensator.service.session import session_config
 from tests.audit.made import MACHINE
 from tests.audit.tampering import Line, rewrite
 from tests.audit.test_replay import look, replayable
-from tests.security.shop import free_port
+from tests.ports import free_port
 
 ANNA = Sender("anna", "certificate")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -46,6 +45,7 @@ from sim_hardware.wire import (
     RegisterMap,
 )
 from sim_hardware.wire.faults import Faults
+from tests.ports import free_port
 from tests.service.simulated import START_NS, TABLE, config
 
 TIMEOUT_S = 0.4
@@ -65,9 +65,7 @@ class Receiver:
     """Everything that one subscriber gets, by machine; services that publish to it keep their link as it does."""
 
     def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.got: dict[tuple[str, str], list[Any]] = defaultdict(list)
         self._arrived = threading.Condition()
         self._session: Any = None

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.audit.test_signatures import write_key
-from tests.soak.site import Receiver, Site, check_received, end, free_port, is_early
+from tests.ports import free_port
+from tests.soak.site import Receiver, Site, check_received, end, is_early
 
 #: When to kill: at any time; when a finished file is being made compact; when a model is being taken over.
 MOMENTS = ("any", "any", "any", "compacting", "adopting")

@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 import math
-import socket
 import subprocess
 import sys
 import threading
@@ -33,12 +32,6 @@ from compensator.service import presence
 presence.STALE_S = {stale_s}
 raise SystemExit(main())
 """
-
-
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def session(**keys: Any) -> Any:

@@ -9,7 +9,8 @@ from pathlib import Path
 from compensator.audit.machine_audit import audit
 from compensator.receiver import AppliedAxes, AxesReceiver, AxesSettings, ControlState, load_any
 from compensator.recording.reading import recordings
-from tests.receiver.wire import free_port, router, until
+from tests.ports import free_port
+from tests.receiver.wire import router, until
 from tests.soak.axes_site import PERIOD_S, RATES, Axes, AxesSite, levers
 
 AT_MM, TOOL_MM = 500.0, 220.0

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.soak.site import Receiver, Site, check_received, free_port, is_early
+from tests.ports import free_port
+from tests.soak.site import Receiver, Site, check_received, is_early
 
 PERIOD_S = 0.25
 

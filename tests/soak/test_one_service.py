@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
+from tests.ports import free_port
 from tests.receiver.wire import router
-from tests.soak.site import PATIENCE_S, Receiver, Site, check_received, end, free_port
+from tests.soak.site import PATIENCE_S, Receiver, Site, check_received, end
 
 PERIOD_S = 0.25
 

@@ -15,8 +15,9 @@ from compensator.config import load_config
 from compensator.messages import ProbeRequest, shipped_schema
 from compensator.recording.reading import messages, recordings
 from compensator.service.command_client import send_probe
+from tests.ports import free_port
 from tests.receiver.wire import router
-from tests.soak.site import RATE_UM_PER_MIN, Receiver, Site, end, free_port
+from tests.soak.site import RATE_UM_PER_MIN, Receiver, Site, end
 
 PERIOD_S = 0.5
 PROBE = """[probe]

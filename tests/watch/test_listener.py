@@ -18,7 +18,7 @@ from compensator.service.publisher import COMMANDS, Publisher, Sender
 from compensator.service.session import session_config
 from compensator.watch.listener import Listener, of_endpoints, of_settings
 from compensator.watch.shop import Shop
-from tests.cli.test_adopt import free_port
+from tests.ports import free_port
 from tests.watch.heard import event, offset, sample, status
 
 
