@@ -35,13 +35,12 @@ from compensator.data.measurement import (
 from compensator.data.runs import Run
 from compensator.data.screening import require_y_noise
 from compensator.diagnose.across import MachineEffect, across, missing_places
+from compensator.diagnose.choice.found_effect import FoundEffect
+from compensator.diagnose.choice.outcome import Diagnosis
+from compensator.diagnose.choice.verdict import BASE, EXTENDED, HELD_OUT, SEARCHED, verdict_of
 from compensator.diagnose.diagnosis import DiagnosisOptions
 from compensator.diagnose.diagnosis import diagnose as find_effects
-from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run_words import BASE, EXTENDED, HELD_OUT, SEARCHED
-from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.summary import contents, figures
-from compensator.diagnose.verdict import verdict_of
+from compensator.diagnose.words.summary import contents, figures
 from compensator.display import Listing, Table, Words
 from compensator.errors import UsageError, of_files
 from compensator.identify.pairs import pairs

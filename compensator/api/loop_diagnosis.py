@@ -17,9 +17,9 @@ from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
-from compensator.diagnose.change import changed_at
-from compensator.diagnose.deployment import SHORT_H
-from compensator.diagnose.onset import WELL_EXPLAINED, left_part
+from compensator.diagnose.choice.deployment import SHORT_H
+from compensator.diagnose.choice.onset import WELL_EXPLAINED, left_part
+from compensator.diagnose.residual.change import changed_at
 from compensator.errors import CompensatorError, DataError
 from compensator.model.effects.names import name_of
 from compensator.model.model_file import parse_model

@@ -15,7 +15,7 @@ from compensator.commands.workers import workers
 from compensator.data.axes import AxisLike
 from compensator.data.measurement import measurements
 from compensator.data.table import roles_of
-from compensator.diagnose.prediction import FOLDS
+from compensator.diagnose.fitting.prediction import FOLDS
 
 #: Values up to which a search runs in this process; starting others takes as long.
 ALONE = 30_000

@@ -14,13 +14,13 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.axes import label_of
-from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Start, Term, fit_terms, response, settled
-from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.likelihood import Likelihood, rest_without_effects
-from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.points import Points
-from compensator.diagnose.standard_errors import deviations
+from compensator.diagnose.choice.found_effect import FoundEffect
+from compensator.diagnose.choice.outcome import Diagnosis
+from compensator.diagnose.fitting.fit import Fit, Start, Term, fit_terms, response, settled
+from compensator.diagnose.fitting.likelihood import Likelihood, rest_without_effects
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.fitting.standard_errors import deviations
+from compensator.diagnose.residual.evidence import Evidence
 from compensator.model.effects.hypothesis import Place
 
 #: An axis shows an effect if it moves it by at least so many standard errors.

@@ -16,25 +16,25 @@ import numpy as np
 from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
-from compensator.diagnose.advice import Advice, advice_of
-from compensator.diagnose.ceiling import Ceiling, ceiling_of
-from compensator.diagnose.chips import without_chips
-from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.deployment import CONTRADICTS, Deployment, deployment_of
-from compensator.diagnose.detection_limit import detection_limits
-from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.extended_model import extended_model
-from compensator.diagnose.findings import Findings, findings_of
-from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
-from compensator.diagnose.initial_state import as_begun
-from compensator.diagnose.named_effects import named_effects, ranked
-from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.outcome import Diagnosis, Refused, Remainder
-from compensator.diagnose.prediction import FOLDS
-from compensator.diagnose.trials import Trials
-from compensator.diagnose.verdict import Judged, judged
-from compensator.diagnose.warning_words import ceiling_in_part, warnings_on
+from compensator.diagnose.advice.advice import Advice, advice_of
+from compensator.diagnose.advice.ceiling import Ceiling, ceiling_of
+from compensator.diagnose.advice.deciding import Deciding, PlannedTest
+from compensator.diagnose.advice.trials import Trials
+from compensator.diagnose.choice.deployment import CONTRADICTS, Deployment, deployment_of
+from compensator.diagnose.choice.extended_model import extended_model
+from compensator.diagnose.choice.found_effect import FoundEffect
+from compensator.diagnose.choice.held_out import HeldOut, held_out_of, how_held_out
+from compensator.diagnose.choice.named_effects import named_effects, ranked
+from compensator.diagnose.choice.onset import explains_better, onset_in
+from compensator.diagnose.choice.outcome import Diagnosis, Refused, Remainder
+from compensator.diagnose.choice.verdict import Judged, judged
+from compensator.diagnose.fitting.prediction import FOLDS
+from compensator.diagnose.residual.evidence import Evidence, evidence_of
+from compensator.diagnose.search.chips import without_chips
+from compensator.diagnose.search.detection_limit import detection_limits
+from compensator.diagnose.search.findings import Findings, findings_of
+from compensator.diagnose.search.initial_state import as_begun
+from compensator.diagnose.words.warning_words import ceiling_in_part, warnings_on
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import Place
 from compensator.model.thermal_model import ThermalModel

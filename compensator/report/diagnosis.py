@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.advice_words import advice_lines
-from compensator.diagnose.ceiling_words import ceiling, falls_short
-from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run_words import off_zero
-from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.remainder_words import remainder
-from compensator.diagnose.standing import is_in_the_model
-from compensator.diagnose.summary import (
+from compensator.diagnose.choice.found_effect import FoundEffect
+from compensator.diagnose.choice.outcome import Diagnosis
+from compensator.diagnose.choice.verdict import is_contradicted
+from compensator.diagnose.words.advice_words import advice_lines
+from compensator.diagnose.words.ceiling_words import ceiling, falls_short
+from compensator.diagnose.words.free_run_words import off_zero
+from compensator.diagnose.words.remainder_words import remainder
+from compensator.diagnose.words.standing import is_in_the_model
+from compensator.diagnose.words.summary import (
     SHOWN,
     channels_to_configure,
     error_table,
@@ -27,7 +28,6 @@ from compensator.diagnose.summary import (
     parameter_table,
     rivals,
 )
-from compensator.diagnose.verdict import is_contradicted
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel

@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 
 from compensator.arrays import NAN, Indices, Vector, rms_of
-from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.outcome import Diagnosis
-from compensator.diagnose.prediction import FOLDS
-from compensator.diagnose.summary import name
+from compensator.diagnose.choice.found_effect import FoundEffect
+from compensator.diagnose.choice.outcome import Diagnosis
+from compensator.diagnose.fitting.prediction import FOLDS
+from compensator.diagnose.words.summary import name
 from compensator.report.figure import Bar, Edges, Figure, Line
 from compensator.report.local_time import shown, zone_at
 

@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 from compensator.axes import label_of
-from compensator.diagnose.summary import headline
+from compensator.diagnose.words.summary import headline
 from compensator.identify.summary import verdict as calibration_verdict
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, parse_toml, read_file, resolved
 from compensator.model.model_file import HELD_OUT_KEY

@@ -50,7 +50,7 @@ def test_every_name_is_there(name: str) -> None:
 
 def test_a_room_of_a_verb_s_name_does_not_take_its_place() -> None:
     code = (
-        "import compensator.identify.settings, compensator.diagnose.outcome, compensator as tc; "
+        "import compensator.identify.settings, compensator.diagnose.choice.outcome, compensator as tc; "
         "from compensator.identify.settings import Settings; print(tc.identify.__name__, tc.diagnose.__name__)"
     )
     assert python(code) == "identify diagnose"

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.search import Search
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.search import Search
 from compensator.identify.calibration import predict
 from compensator.model.model_file import load_model
 from tests.bench.figures import Figure, rows, told

@@ -15,9 +15,9 @@ import numpy as np
 
 import compensator as tc
 from compensator.data.measurement import measurements, runs_in
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.nearest import nearest
+from compensator.diagnose.advice.nearest import nearest
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
 from compensator.identify.calibration import predict
 from tests.bench.figures import Figure, rows, told
 from tests.diagnose.scenarios import lag

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.search import Search
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.search import Search
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from sim_hardware.physics import Duty, QuillMachine, World, draw_effect, usual_sensors

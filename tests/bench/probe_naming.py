@@ -22,7 +22,7 @@ import numpy as np
 import compensator as tc
 from compensator.blas import in_one_thread
 from compensator.data.measurement import runs_in
-from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.residual.evidence import evidence_of
 from sim_hardware.drawn_machines import draw
 from sim_hardware.drawn_machines.catalogue import EFFECTS
 from tests.bench.figures import Figure, rows, told

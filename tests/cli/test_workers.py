@@ -19,8 +19,8 @@ from compensator.commands import diagnose as diagnose_command
 from compensator.commands.workers import in_parallel
 from compensator.demo.calibration import write_table
 from compensator.diagnose import diagnosis
-from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.residual.evidence import Evidence
+from compensator.diagnose.search.findings import Findings, findings_of
 from compensator.errors import ServiceError
 from tests.audit.made import START_NS, Service
 from tests.cli.jobs import ended_job, job

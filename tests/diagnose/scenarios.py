@@ -7,8 +7,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import compensator as tc
-from compensator.diagnose.deployment import Deployment
-from compensator.diagnose.held_out import HeldOut
+from compensator.diagnose.choice.deployment import Deployment
+from compensator.diagnose.choice.held_out import HeldOut
 from sim_hardware.physics import Duty
 from sim_hardware.physics.published import DEFORMATION_POLES, DTF, TDTF, TTF, TTF_POLES, tustin
 

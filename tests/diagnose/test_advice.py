@@ -6,21 +6,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from compensator.diagnose.advice import Unexplained, _sensor, advice_of, resembling
-from compensator.diagnose.deciding import DECIDES, Deciding
+from compensator.diagnose.advice.advice import Unexplained, _sensor, advice_of, resembling
+from compensator.diagnose.advice.deciding import DECIDES, Deciding
+from compensator.diagnose.advice.nearest import Near, nearest
+from compensator.diagnose.advice.record_with_test import HOURS as HOURS_OF_TESTS
+from compensator.diagnose.advice.record_with_test import expected_change
+from compensator.diagnose.advice.switched import follows_day, goes_with, steepest, swings, switched
+from compensator.diagnose.advice.trials import LEVEL_H, REST_H, Trials
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms, settled
-from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.nearest import Near, nearest
-from compensator.diagnose.points import Points
-from compensator.diagnose.record_with_test import HOURS as HOURS_OF_TESTS
-from compensator.diagnose.record_with_test import expected_change
-from compensator.diagnose.summary import contents, figures
-from compensator.diagnose.switched import follows_day, goes_with, steepest, swings, switched
-from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
-from compensator.diagnose.warning_words import warnings_on
+from compensator.diagnose.fitting.fit import fit_terms, settled
+from compensator.diagnose.fitting.likelihood import Likelihood
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.words.summary import contents, figures
+from compensator.diagnose.words.warning_words import warnings_on
 from compensator.display import Words
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of

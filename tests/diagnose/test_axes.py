@@ -14,9 +14,9 @@ from compensator.cli import main
 from compensator.data.axes import of_axis
 from compensator.data.measurement import measurements, runs_in
 from compensator.diagnose.across import MachineEffect, Share, across, missing_places
-from compensator.diagnose.criterion import MARGIN, Criterion
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import Term, response
+from compensator.diagnose.fitting.fit import Term, response
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.criterion import MARGIN, Criterion
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_axes
 from compensator.model.model_writer import write_axes

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose import search as search_module
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import Term, response
-from compensator.diagnose.search import Search
+from compensator.diagnose.fitting.fit import Term, response
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search import search as search_module
+from compensator.diagnose.search.search import Search
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from compensator.diagnose.descent import least_squares
+from compensator.diagnose.fitting.descent import least_squares
 
 T = np.linspace(0.0, 5.0, 200)
 LOW, HIGH = np.array([-3.0, -2.0]), np.array([3.0, 2.0])

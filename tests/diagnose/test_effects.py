@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose.base_run import signals_of
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import Term, response
+from compensator.diagnose.fitting.fit import Term, response
+from compensator.diagnose.residual.base_run import signals_of
+from compensator.diagnose.residual.evidence import evidence_of
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from, kinds
 from compensator.model.effects.hypothesis import proposals

@@ -9,9 +9,9 @@ import re
 import numpy as np
 import pytest
 
-from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.fit import Term, response
-from compensator.diagnose.found_effect import described, seen_of
+from compensator.diagnose.choice.found_effect import described, seen_of
+from compensator.diagnose.fitting.fit import Term, response
+from compensator.diagnose.residual.evidence import Evidence, evidence_of
 from compensator.model.effects import Effect, effect_from
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.seen import Range, Seen

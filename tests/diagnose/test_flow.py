@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
 from compensator.identify.calibration import predict
 from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose import search as search_module
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import fit_terms, settled
-from compensator.diagnose.likelihood import Likelihood, rest_without_effects
-from compensator.diagnose.prediction import Folds
-from compensator.diagnose.search import FORETELLS, Search
+from compensator.diagnose.fitting.fit import fit_terms, settled
+from compensator.diagnose.fitting.likelihood import Likelihood, rest_without_effects
+from compensator.diagnose.fitting.prediction import Folds
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search import search as search_module
+from compensator.diagnose.search.search import FORETELLS, Search
 from tests.diagnose.scenarios import Scenario, draw, lag, record
 from tests.diagnose.test_own_error import BASE
 from tests.identify.quill_runs import runs_from

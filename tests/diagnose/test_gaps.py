@@ -8,9 +8,9 @@ import pytest
 
 import compensator as tc
 from compensator.data.measurement import measurements, read, screened_runs_in
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.initial_state import as_begun
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.search.initial_state import as_begun
 from compensator.model.effects.base import effect_from
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record

@@ -6,12 +6,12 @@ import functools
 import numpy as np
 import pytest
 
-from compensator.diagnose import held_out as module
-from compensator.diagnose.deployment import _with_remainder_that_helps
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.held_out import _RESTS, _of_channels, _predictions, held_out_of
-from compensator.diagnose.prediction import FOLDS
+from compensator.diagnose.choice import held_out as module
+from compensator.diagnose.choice.deployment import _with_remainder_that_helps
+from compensator.diagnose.choice.held_out import _RESTS, _of_channels, _predictions, held_out_of
+from compensator.diagnose.fitting.prediction import FOLDS
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
 from compensator.model.model_file import load_model
 from compensator.progress import unreported
 from tests.diagnose.scenarios import draw, held_out_errors, record

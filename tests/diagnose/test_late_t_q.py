@@ -10,14 +10,14 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.data.runs import Run
-from compensator.diagnose import foresight
-from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import Term, fit_terms
-from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.points import Points
+from compensator.diagnose.fitting.fit import Term, fit_terms
+from compensator.diagnose.fitting.likelihood import Likelihood
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.residual.base_run import signals_of
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search import foresight
+from compensator.diagnose.search.findings import findings_of
 from compensator.identify.calibration import predict
 from compensator.model.effects.base import Effect, effect_from, filters
 from compensator.model.effects.delay import DelayedSensor

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from compensator.diagnose import likelihood as likelihood_module
-from compensator.diagnose.background import Background, _Problem
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import fit_terms
-from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
-from compensator.diagnose.points import Points, SlowRest
-from compensator.diagnose.scan import Scan
-from compensator.diagnose.search import Search
-from compensator.diagnose.whitening import MANY, Whitening
+from compensator.diagnose.fitting import likelihood as likelihood_module
+from compensator.diagnose.fitting.fit import fit_terms
+from compensator.diagnose.fitting.likelihood import Likelihood, RandomColumns, learned_rest
+from compensator.diagnose.fitting.points import Points, SlowRest
+from compensator.diagnose.fitting.whitening import MANY, Whitening
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.background import Background, _Problem
+from compensator.diagnose.search.scan import Scan
+from compensator.diagnose.search.search import Search
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
@@ -129,7 +129,7 @@ def test_slopes_of_the_evidence_are_those_of_differences(evidence, monkeypatch):
     monkeypatch.setattr(likelihood_module, "minimize", minimised)
     with pytest.raises(StopIteration):
         learned_rest(points, np.zeros((points.count, 0)), np.zeros(points.count), REST)
-    from compensator.diagnose import background as background_module
+    from compensator.diagnose.search import background as background_module
 
     monkeypatch.setattr(background_module, "minimize", minimised)
     with pytest.raises(StopIteration):

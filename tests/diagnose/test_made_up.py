@@ -12,13 +12,13 @@ import pytest
 import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.measurement import measurements, runs_in
-from compensator.diagnose import deployment
-from compensator.diagnose import findings as module
-from compensator.diagnose.deployment import CONTRADICTS, _by_channels, _decided
+from compensator.diagnose.choice import deployment
+from compensator.diagnose.choice.deployment import CONTRADICTS, _by_channels, _decided
 from compensator.diagnose.diagnosis import _evidence
-from compensator.diagnose.findings import Findings, by_channels, findings_of, in_free_run
-from compensator.diagnose.summary import verdict
-from compensator.diagnose.warning_words import warnings_on
+from compensator.diagnose.search import findings as module
+from compensator.diagnose.search.findings import Findings, by_channels, findings_of, in_free_run
+from compensator.diagnose.words.summary import verdict
+from compensator.diagnose.words.warning_words import warnings_on
 from sim_hardware.drawn_machines.cases import _cases
 from tests.diagnose.scenarios import chosen, errors_on_another_day, held_out_errors
 from tests.diagnose.test_standing import found as diagnosed

@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.data.measurement import measurements, runs_in
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.no_causes import no_causes
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.residual.no_causes import no_causes
 from compensator.model.model_file import load_model
 from tests.data.test_cleaning import N, machine
 

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from compensator.codes import ModelWarning
-from compensator.diagnose import background, diagnosis, held_out
-from compensator.diagnose.background import Background
+from compensator.diagnose import diagnosis
+from compensator.diagnose.choice import held_out
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.summary import figures, verdict
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search import background
+from compensator.diagnose.search.background import Background
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.words.summary import figures, verdict
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, lag, record
 from tests.identify.quill_runs import runs_from

@@ -7,9 +7,9 @@ import pytest
 
 import compensator as tc
 from compensator.diagnose import diagnosis
-from compensator.diagnose.change import changed_at
-from compensator.diagnose.onset import explains_better, onset_in
-from compensator.diagnose.summary import headline
+from compensator.diagnose.choice.onset import explains_better, onset_in
+from compensator.diagnose.residual.change import changed_at
+from compensator.diagnose.words.summary import headline
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 

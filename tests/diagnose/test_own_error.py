@@ -8,15 +8,15 @@ from scipy.signal import lfilter
 
 import compensator as tc
 from compensator.diagnose import diagnosis
-from compensator.diagnose.deployment import _as_far_as_confirmed, deployment_of
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms, response, settled
-from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.own_error import foretelling, own_error
-from compensator.diagnose.points import Points
-from compensator.diagnose.search import Search
-from compensator.diagnose.summary import figures
+from compensator.diagnose.choice.deployment import _as_far_as_confirmed, deployment_of
+from compensator.diagnose.fitting.fit import fit_terms, response, settled
+from compensator.diagnose.fitting.likelihood import Likelihood
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.search.own_error import foretelling, own_error
+from compensator.diagnose.search.search import Search
+from compensator.diagnose.words.summary import figures
 from compensator.model.model_file import load_model
 from sim_hardware.drawn_machines.cases import _cases
 from tests.diagnose.scenarios import draw, errors_on_another_day, held_out_errors, lag, record

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.diagnose.choice.held_out import how_held_out, left_of_block, zeros_known
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.held_out import how_held_out, left_of_block, zeros_known
-from compensator.diagnose.points import Points
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 from tests.identify.quill_runs import runs_from

@@ -11,13 +11,13 @@ from compensator.arrays import rms_of
 from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
-from compensator.diagnose.background import LAGS_MIN, Background
+from compensator.diagnose.choice.extended_model import with_effects
+from compensator.diagnose.choice.verdict import Judged
 from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.extended_model import with_effects
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.refitted_paths import with_fewer_lags, with_paths
-from compensator.diagnose.verdict import Judged
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.background import LAGS_MIN, Background
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.search.refitted_paths import with_fewer_lags, with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from compensator.model.effects.blocks import FilterBank, lag_or_none

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose import deployment as deployment_module
 from compensator.diagnose import diagnosis as diagnosis_module
+from compensator.diagnose.choice import deployment as deployment_module
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import Term, fit_terms
-from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.points import Points
-from compensator.diagnose.search import Search
-from compensator.diagnose.standard_errors import deviations, standard_errors
-from compensator.diagnose.summary import figures, verdict
+from compensator.diagnose.fitting.fit import Term, fit_terms
+from compensator.diagnose.fitting.likelihood import Likelihood
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.fitting.standard_errors import deviations, standard_errors
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.search import Search
+from compensator.diagnose.words.summary import figures, verdict
 from compensator.display import is_determined
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals

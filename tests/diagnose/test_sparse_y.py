@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 
 import compensator as tc
-from compensator.diagnose import diagnosis, held_out
-from compensator.diagnose.background import Background
-from compensator.diagnose.chips import without_chips
-from compensator.diagnose.detection_limit import detection_limits
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms
-from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.points import Points, SlowRest
-from compensator.diagnose.record_with_test import HOURS, RecordWithTest
-from compensator.diagnose.search import Search
-from compensator.diagnose.switched import HEAT
-from compensator.diagnose.trials import Trials
-from compensator.diagnose.whitening import Whitening
+from compensator.diagnose import diagnosis
+from compensator.diagnose.advice.record_with_test import HOURS, RecordWithTest
+from compensator.diagnose.advice.switched import HEAT
+from compensator.diagnose.advice.trials import Trials
+from compensator.diagnose.choice import held_out
+from compensator.diagnose.fitting.fit import fit_terms
+from compensator.diagnose.fitting.likelihood import Likelihood
+from compensator.diagnose.fitting.points import Points, SlowRest
+from compensator.diagnose.fitting.whitening import Whitening
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.background import Background
+from compensator.diagnose.search.chips import without_chips
+from compensator.diagnose.search.detection_limit import detection_limits
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.search.search import Search
 from compensator.errors import DataError
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model

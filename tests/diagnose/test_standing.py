@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensator.diagnose.ceiling import ceiling_of
-from compensator.diagnose.ceiling_words import ceiling, explained
-from compensator.diagnose.found_effect import FoundEffect, rivals_of
-from compensator.diagnose.remainder_words import remainder
-from compensator.diagnose.summary import headline
-from compensator.diagnose.verdict import verdict_of
+from compensator.diagnose.advice.ceiling import ceiling_of
+from compensator.diagnose.choice.found_effect import FoundEffect, rivals_of
+from compensator.diagnose.choice.verdict import verdict_of
+from compensator.diagnose.words.ceiling_words import ceiling, explained
+from compensator.diagnose.words.remainder_words import remainder
+from compensator.diagnose.words.summary import headline
 from compensator.report.diagnosis import tone_of
 from tests.diagnose.scenarios import held_out_errors
 

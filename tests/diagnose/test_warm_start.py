@@ -8,11 +8,11 @@ import pytest
 import compensator as tc
 from compensator.codes import ModelWarning
 from compensator.data.record import SampledRecord
-from compensator.diagnose.base_run import context_of
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.findings import findings_of
-from compensator.diagnose.initial_state import as_begun
-from compensator.diagnose.search import Search
+from compensator.diagnose.residual.base_run import context_of
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.search.findings import findings_of
+from compensator.diagnose.search.initial_state import as_begun
+from compensator.diagnose.search.search import Search
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import COOLEST, EQUAL, proposals
 from compensator.model.model_file import load_model

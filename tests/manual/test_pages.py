@@ -54,11 +54,10 @@ def test_quoted_constants_are_those_of_the_code(page: Path, least: int) -> None:
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
-    """Everything that is assigned at the top of the modules of a folder."""
+    """Everything that is assigned at the top of the modules of a folder, and of those below it."""
     found: dict[str, Any] = {}
-    package = ".".join(folder.relative_to(TOP).parts)
-    for file in sorted(folder.glob("[!_]*.py")):
-        module = importlib.import_module(f"{package}.{file.stem}")
+    for file in sorted(folder.rglob("[!_]*.py")):
+        module = importlib.import_module(".".join(file.relative_to(TOP).with_suffix("").parts))
         assigned = [node for node in ast.parse(file.read_text("utf-8")).body if isinstance(node, ast.Assign)]
         targets = [name for node in assigned for target in node.targets for name in ast.walk(target)]
         found |= {f"{file.stem}.{t.id}": getattr(module, t.id) for t in targets if isinstance(t, ast.Name)}

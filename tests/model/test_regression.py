@@ -17,10 +17,10 @@ from scipy import signal
 from compensator.audit.machine_audit import audit, summary
 from compensator.cli import main
 from compensator.demo.calibration import write_table
-from compensator.diagnose.ceiling_words import ceiling
-from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
-from compensator.diagnose.remainder_words import remainder
-from compensator.diagnose.summary import figures, verdict
+from compensator.diagnose.choice.outcome import Ceiling, Diagnosis, Remainder
+from compensator.diagnose.words.ceiling_words import ceiling
+from compensator.diagnose.words.remainder_words import remainder
+from compensator.diagnose.words.summary import figures, verdict
 from compensator.errors import ModelError, ServiceError
 from compensator.messages import Offset, number
 from compensator.model.effects import effect_from
@@ -464,7 +464,7 @@ def test_simulate_runs_the_extended_model(tmp_path: Path) -> None:
 
 
 def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    from compensator.diagnose import summary as page
+    from compensator.diagnose.words import summary as page
 
     class Bare:
         verdict = "explained"

@@ -16,13 +16,13 @@ import pytest
 import compensator as tc
 from compensator.arrays import rms_of
 from compensator.data.measurement import read
-from compensator.diagnose import held_out as held_out_module
-from compensator.diagnose.advice import Advice, Unexplained
-from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.outcome import Ceiling, Diagnosis, Refused, Remainder, Step
-from compensator.diagnose.points import Points
-from compensator.diagnose.prediction import FOLDS
-from compensator.diagnose.summary import contents, error_table, figures, headline, name, verdict
+from compensator.diagnose.advice.advice import Advice, Unexplained
+from compensator.diagnose.choice import held_out as held_out_module
+from compensator.diagnose.choice.outcome import Ceiling, Diagnosis, Refused, Remainder, Step
+from compensator.diagnose.fitting.points import Points
+from compensator.diagnose.fitting.prediction import FOLDS
+from compensator.diagnose.residual.evidence import evidence_of
+from compensator.diagnose.words.summary import contents, error_table, figures, headline, name, verdict
 from compensator.display import text_of_all
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of, tone_of

@@ -11,7 +11,7 @@ from compensator.arrays import rms_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import LoopSettings
-from compensator.diagnose.change import QUIET
+from compensator.diagnose.residual.change import QUIET
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h

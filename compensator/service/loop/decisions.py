@@ -15,7 +15,7 @@ import msgspec
 
 from compensator.clock import HOUR_NS, NS
 from compensator.config import LoopSettings
-from compensator.diagnose.change import BLOCK_MIN
+from compensator.diagnose.residual.change import BLOCK_MIN
 from compensator.errors import ServiceError
 from compensator.events import DiagnosisData, LoopAction, Note
 from compensator.service.loop.avoided import avoid

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from compensator.arrays import Vector, rms_of
-from compensator.diagnose.change import BLOCK_MIN, FEWEST_BLOCKS, QUIET, changed_at
+from compensator.diagnose.residual.change import BLOCK_MIN, FEWEST_BLOCKS, QUIET, changed_at
 from compensator.messages import number
 from compensator.service.loop.trust import is_disturbed
 from compensator.service.outcome import Outcome, sets_zero, sets_zero_at_rest

@@ -19,7 +19,7 @@ from compensator.axes import FIRST, AxisWords, label_of
 from compensator.clock import HOUR_NS
 from compensator.codes import Reason
 from compensator.config import Config
-from compensator.diagnose.change import BLOCK_MIN
+from compensator.diagnose.residual.change import BLOCK_MIN
 from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.model.thermal_model import ThermalModel

@@ -16,7 +16,7 @@ import numpy as np
 from compensator.arrays import Vector, rms_of
 from compensator.axes import FIRST
 from compensator.clock import HOUR_NS, NS
-from compensator.diagnose.change import BLOCK_MIN
+from compensator.diagnose.residual.change import BLOCK_MIN
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.messages import number
 from compensator.messages_axes import AxesEstimate

@@ -1,0 +1,1 @@
+"""What of the findings is deployed, the verdict, and the result."""

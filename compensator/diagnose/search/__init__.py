@@ -1,0 +1,1 @@
+"""The search for effects: scan, criterion, exchange, and what is found in some evidence."""
