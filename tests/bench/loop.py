@@ -96,7 +96,8 @@ class Service:
     def __init__(self, config, model, diagnoses):
         self._made = lambda: OfflineLoop(config, model, diagnoses)
         self.run = self._made()
-        self.steps = []
+        #: Every model that was in force, by hash.
+        self.steps, self.models = [], {}
         self._kept, self._state = 0, self.run.state()
 
     def process(self, sample, probe, is_visit):
@@ -105,6 +106,7 @@ class Service:
             self._kept, self._state = len(self.steps), self.run.state()
         step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
         self.steps.append((sample, probe, step, is_visit))
+        self.models.setdefault(step.model_sha256, self.run.compensation.model)
         return step
 
     def restart(self):
@@ -190,11 +192,9 @@ def _figures(week):
         "best": bound.best,
         "bound": bound.error,
     }
-    files = {hashlib.sha256(data).hexdigest(): data for data in _files(file, diagnoses)}
-    used = list(dict.fromkeys(step.model_sha256 for step in steps))
-    for sha in used:
-        errors[sha] = error_of(run_alone(config, parse_model(files[sha], source=sha), samples), week.true_um)
-    base_sha = used[0]
+    for sha, model in service.models.items():
+        errors[sha] = error_of(run_alone(config, model, samples), week.true_um)
+    base_sha = steps[0].model_sha256
     for error in errors.values():
         error[~whole(week)] = math.nan
     return {
@@ -220,10 +220,6 @@ def _recorded(diagnoses):
     recorded = Diagnoses(lambda *_: Diagnosed("failed", (), None, "the first run did not ask for this diagnosis"))
     recorded.found = dict(diagnoses.found)
     return recorded
-
-
-def _files(base, diagnoses):
-    return [base, *(one.model for one in diagnoses.found.values() if one.model is not None)]
 
 
 def _changes(steps, errors):

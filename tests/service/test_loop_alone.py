@@ -35,7 +35,7 @@ def outcome(minute: int, residual_um: float, y_um: float, reasons: Sequence[str]
     """An outcome as far as the loop reads it; a probe shows so much beyond the prediction, ±1.5 µm."""
     shown = [SimpleNamespace(innovation_um=one, innovation_std_um=1.5, taken=True) for one in probes_um]
     sample = SimpleNamespace(time_utc_ns=BEGIN_NS + minute * 60 * NS, period_s=60.0)
-    estimate = SimpleNamespace(residual_um=residual_um, y_um=y_um)
+    estimate = SimpleNamespace(residual_um=residual_um, y_um=y_um, y_base_um=0.0)
     offset = SimpleNamespace(reasons=list(reasons))
     return cast(Outcome, SimpleNamespace(sample=sample, estimate=estimate, offset=offset, notes=[], probes=shown))
 

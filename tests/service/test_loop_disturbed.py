@@ -17,7 +17,7 @@ from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.core import LOOP_STATE, ShadowedLoop, shadow_files
 from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.schedule import begin_if_due, pass_planned
-from compensator.service.loop.state import LoopState
+from compensator.service.loop.state import STATE_SCHEMA, LoopState
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import NIGHT, Night, decisions, evening, extended, run, settings, shown
 from tests.service.test_restart import QUILL
@@ -114,7 +114,7 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
         whole | {model: extended(2.0)},
         whole | {state: whole[state][:-20]},
         whole | {LOOP_STATE: whole[LOOP_STATE][:-20]},
-        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":9', b'{"schema":8')},
+        whole | {LOOP_STATE: whole[LOOP_STATE].replace(b'{"schema":%d' % STATE_SCHEMA, b'{"schema":8')},
     ):
         with pytest.raises(CompensatorError):
             ShadowedLoop(settings(), present.model, damaged)

@@ -44,10 +44,12 @@ from tests.service.looping import (
     errors,
     evening,
     extended,
+    grown,
     machine,
     run,
     settings,
     shown,
+    stronger,
 )
 from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
@@ -76,6 +78,24 @@ def test_the_level_is_what_measured_y_shows_since_the_effect_began():
     assert "y_moved" not in event.data["comparison"] and abs(event.data["level_um"]) == pytest.approx(12.0, abs=1.0)
     # Counted from the zero, when the coolant was 4 K warmer, it would be wrong by 12 µm.
     assert abs(np.mean(after)) < 1.0 and np.std(after) < 1.0
+
+
+@pytest.mark.parametrize("begins", [0, 390])
+def test_the_level_of_what_began_after_a_zero_on_a_warm_machine_is_that_of_the_present_model(begins):
+    """What the candidate adds is 30 % of the heat's share: at the zero it adds that only if it acted there."""
+    grew = grown(0.3)
+    loop = OfflineLoop(settings(), QUILL_FILE, Night(shown(stronger(0.3))))
+    more = {"more": lambda i: grew(i) * (i >= begins)}
+    samples = from_noon(NIGHT + 20 * 60, lambda i: 0.0, **more)
+    run(loop, samples, 300)
+    loop.compensation.zero("warm")
+    steps = run(loop, samples)
+    acted_um = grew(300)
+    assert abs(acted_um) > 5.0
+    (event,) = [note for step in steps for note in step.events if note.kind == "adopt"]
+    assert event.data["level_um"] == pytest.approx(acted_um if begins else 0.0, abs=1.0)
+    left_um = [step.outcome.estimate.residual_um for step in steps[-300:]]
+    assert abs(np.mean(left_um)) < 1.0
 
 
 def test_a_zero_between_the_decision_and_the_exchange_ends_the_level_of_the_zero_before():
@@ -198,6 +218,26 @@ def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clea
     place.comparison = ComparisonState(blocks=blocks)
     found = Compared(place, settings().loop, 60.0, ErrorBlocks())
     assert found.level_at_return_um == pytest.approx(raised_um, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("own_um", "other_um", "kept_um", "level_um"),
+    [
+        (10.0, 12.0, 12.0, 12.0),
+        (10.0, 1.0, 12.0, 0.0),
+        (10.0, 3.0, 4.0, 4.0),  # both are better: the nearer one
+        (10.0, 21.0, 12.0, None),  # neither is
+    ],
+)
+def test_the_level_of_newer_parameters_is_their_own_or_that_of_the_present_ones(own_um, other_um, kept_um, level_um):
+    blocks = [Block(0, n, 30, (0.0, 0.0), (own_um, other_um + 0.1 * (n % 2), 0.0)) for n in range(9)]
+    changes = {"present_rms_um": own_um, "candidate_rms_um": other_um, "measured_by": "sensor"}
+    verdict = msgspec.structs.replace(NO_VERDICT, **changes)
+    place = InShadow(sha256="b" * 64, effects=[], role="candidate", since_utc_ns=1, verdict=verdict)
+    place.comparison, place.kept_level_um = ComparisonState(blocks=blocks), kept_um
+    assert Compared(place, settings().loop, 60.0, ErrorBlocks(), same=True).level_um == level_um
+    place.comparison = ComparisonState(blocks=blocks[:7])  # less than four hours do not show that of the present ones
+    assert Compared(place, settings().loop, 60.0, ErrorBlocks(), same=True).level_um == (None if level_um else level_um)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from compensator.codes import Reason
 from compensator.config import LoopSettings
 from compensator.diagnose.residual.change import QUIET
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
+from compensator.messages import number
 from compensator.service.loop.level import ErrorBlocks, level_um
 from compensator.service.loop.place import remembered_h
 from compensator.service.loop.proof import (
@@ -82,6 +83,8 @@ class Compared:
     def add(self, present: Outcome, other: Outcome) -> bool:
         """Add a sample, unless it must not judge; return whether the verdict was made anew."""
         self._place.error.update(other)
+        kept_um = number(other.estimate.y_base_um) - number(present.estimate.y_base_um)
+        self._place.kept_level_um = kept_um if math.isfinite(kept_um) else 0.0
         found = self._comparison
         if self._place.verdict.why == NotJudged.SUSPECT:
             self._place.verdict = NO_VERDICT  # no longer
@@ -186,8 +189,8 @@ class Compared:
         residuals_um, found = self._comparison.residuals_um, self._place.verdict
         if len(residuals_um) < FEWEST_CHANGES or (found.deviations is not None and found.deviations < 0.0):
             return False
-        own_um, other_um = (rms_of(each) for each in np.array(residuals_um).T[1:])
-        return 0.0 < other_um <= ALONE_PART * own_um
+        left_um = self._left_um(self._own_level_um)
+        return 0.0 < left_um <= ALONE_PART * math.hypot(*(own for _, own, _ in residuals_um))
 
     @property
     def _is_itself_better(self) -> bool:
@@ -247,7 +250,8 @@ class Compared:
 
         What adds nothing on a machine at rest has the level of a zero at rest, unless measured Y contradicts it and has
         not moved by itself. What little it leaves about that zero is its own misfit, whose level measured Y shows.
-        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little: a level
+        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little, at one of
+        its own levels (`_own_level_um`); what measured Y shows is taken where that is clearly nearer. A level
         that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
         which of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right
         level: what follows the mount is better, too.
@@ -262,9 +266,31 @@ class Compared:
         part = BETTER_PART if is_probed else LEVEL_PART
         # What creeps beside probes both models are corrected for, and few values often look like a drift.
         shows_level = is_probed or not self._y_moved
-        if shown_um is None and shows_level and is_better_about_zero(verdict, part):
-            return self._comparison.level_um if verdict.y_moved else 0.0
-        return shown_um
+        if not shows_level:
+            return shown_um
+        own_um = self._own_level_um
+        is_right = self._is_better_at(own_um, part) if own_um else is_better_about_zero(verdict, part)
+        is_nearer = shown_um is not None and self._left_um(shown_um) <= LEVEL_PART * self._left_um(own_um)
+        return own_um if is_right and not is_nearer else shown_um
+
+    @property
+    def _own_level_um(self) -> float:
+        """The level at which the other model counts from the last zero, µm: the one that is nearer to measured Y.
+
+        What acted at a zero on a warm machine is in measured Y there, and what the model predicts then is subtracted,
+        which is no level. What began later is not: then what the present model predicts there is subtracted.
+        """
+        kept_um = self._place.kept_level_um
+        return kept_um if self._left_um(kept_um) < self._left_um(0.0) else 0.0
+
+    def _left_um(self, level_um: float) -> float:
+        """Return what the other model leaves about the last zero if it is raised by so much, as the root of a sum."""
+        return math.hypot(*(other - level_um for _, _, other in self._comparison.residuals_um))
+
+    def _is_better_at(self, level_um: float, part: float) -> bool:
+        """Return whether the other model, raised by so much, is better about the last zero."""
+        own_um = [own for _, own, _ in self._comparison.residuals_um]
+        return len(own_um) >= FEWEST_CHANGES and self._left_um(level_um) <= part * math.hypot(*own_um)
 
     @property
     def unknown_level_um(self) -> float:
@@ -278,9 +304,9 @@ class Compared:
         Its level is that of the zero, as if the other one had never been adopted: it is raised to the present level
         only where that is clearly nearer to measured Y, too.
         """
-        residuals_um, raised_um = self._comparison.residuals_um, self.unknown_level_um
-        own, raised = (math.hypot(*(other - by_um for _, _, other in residuals_um)) for by_um in (0.0, raised_um))
-        return raised_um if raised <= LEVEL_PART * own else 0.0
+        raised_um = self.unknown_level_um
+        own_um = self._own_level_um
+        return raised_um if self._left_um(raised_um) <= LEVEL_PART * self._left_um(own_um) else own_um
 
     @property
     def level_at_adoption_um(self) -> float:

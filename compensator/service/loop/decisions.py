@@ -222,7 +222,9 @@ class LoopDecisions:
         notes = decide_exchange(self.state, "adopt", place, self.compared)
         text = f"a better model is adopted: {self._what(place)}; {described(place.verdict)}"
         if self.state.level_um:
-            text += f"; its level is shifted by {self.state.level_um:+.1f} µm, to that of measured Y"
+            kept = self.state.level_um == place.kept_level_um
+            to = "what the present model subtracts at the zero" if kept else "that of measured Y"
+            text += f"; its level is shifted by {self.state.level_um:+.1f} µm, to {to}"
         return [*notes, note_of(self.state, place, LoopAction.ADOPT, text)]
 
     def _propose(self, place: InShadow, choice: Choice) -> list[Note]:

@@ -15,7 +15,7 @@ from compensator.service.loop.level import ErrorBlocks
 from compensator.service.transfer.two_models import ComparisonState, moved
 
 #: Version of the state, and of the rules that decide on it: other rules get a new one. Another one is refused.
-STATE_SCHEMA = 9
+STATE_SCHEMA = 10
 
 #: A candidate may be adopted; to a model from before, or with fewer effects, the service goes back.
 Role = Literal["candidate", "before"]
@@ -86,6 +86,8 @@ class InShadow(msgspec.Struct, kw_only=True):
         For how long it has been at a limit that the present model keeps, min.
     off_at_zero : list of str, optional
         `DiagnosisData.off_at_zero`.
+    kept_level_um : float
+        At this level it predicts what the present model does at the last zero, µm: nothing of what it adds acted there.
     """
 
     sha256: str
@@ -99,6 +101,7 @@ class InShadow(msgspec.Struct, kw_only=True):
     error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     limited_min: float = 0.0
     off_at_zero: list[str] | None = None
+    kept_level_um: float = 0.0
 
     def begin_anew(self) -> None:
         """Forget what was compared."""
