@@ -43,7 +43,7 @@ def test_what_holds_on_another_day_holds_on_the_blocks_that_were_held_out(first)
     model, _ = first
     effect = draw_effect(27, 8.0, 24.0)
     assert effect.reveal().describe()["kind"] == "hysteresis"
-    (run,) = machines.runs(Duty.working_day(104, hours=24.0), 104, [effect])
+    (run,) = machines.runs(Duty.working_day(127, hours=24.0), 127, [effect])
     # No channel takes part in it, and each would be searched four times.
     found = diagnose(model, [dataclasses.replace(run, channels={})])
     assert [e.place[0] for e in found.effects] == ["hysteresis"]
