@@ -103,14 +103,6 @@ class Compared:
         self.judge()
         return True
 
-    def forget_before(self, time_utc_ns: int) -> None:
-        """Forget what was compared before a time, but for so many probes as a candidate needs."""
-        state = self._place.comparison
-        before = len(state.blocks), len(state.probes)
-        self._comparison.forget_before(time_utc_ns, self._settings.probes)
-        if before != (len(state.blocks), len(state.probes)):
-            self.judge()
-
     def judge(self) -> None:
         """Make the verdict anew.
 
@@ -120,6 +112,10 @@ class Compared:
         place, has_taken_over = self._place, bool(self._place.comparison.model_ns)
         wanted = shared(self._settings.deviations, self._alike + has_taken_over)
         place.verdict = self._comparison.verdict(deviations=wanted)
+        if place.role == "before" and place.verdict.verdict != ComparisonVerdict.BETTER:
+            # Where an effect has ended, what was compared before says nothing.
+            latest = self._comparison.latest(deviations=wanted)
+            place.verdict = latest if latest and latest.verdict == ComparisonVerdict.BETTER else place.verdict
         if has_taken_over:
             own = self._comparison.of_itself().verdict(deviations=wanted)
             shows_more = own.deviations is not None and own.deviations > place.shows
@@ -250,11 +246,11 @@ class Compared:
 
         What adds nothing on a machine at rest has the level of a zero at rest, unless measured Y contradicts it and has
         not moved by itself. What little it leaves about that zero is its own misfit, whose level measured Y shows.
-        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little, at one of
-        its own levels (`_own_level_um`); what measured Y shows is taken where that is clearly nearer. A level
-        that contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved;
-        which of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right
-        level: what follows the mount is better, too.
+        Where measured Y does not show it, the candidate must be better about the zero, too, and not by little, at one
+        of its own levels (`_own_level_um`); what measured Y shows is taken where that is clearly nearer. A level that
+        contradicts measured Y counts from a zero that was set before its effect acted, or measured Y has moved; which
+        of them is seen at the next zero. Where a mount creeps, being better about the zero is no sign of a right level:
+        what follows the mount is better, too.
         """
         verdict, off = self._place.verdict, self._place.off_at_zero
         is_probed = verdict.measured_by == "probe"

@@ -32,7 +32,7 @@ from compensator.service.loop.place import (
     why_nothing,
     with_effects,
 )
-from compensator.service.loop.schedule import begin_again, begin_if_due, count_misfit, errs, pass_planned
+from compensator.service.loop.schedule import begin_again, begin_if_due, count_misfit, pass_planned
 from compensator.service.loop.state import InShadow, LoopState, Role, Running, same_effects
 from compensator.service.loop.trust import (
     all_suspect_a_sensor,
@@ -129,10 +129,6 @@ class LoopDecisions:
         state.usable_min = _counted(state.usable_min, present, minutes, suspected=False)
         state.clean_min = _counted(state.clean_min, present, minutes, suspected=suspected)
         count_misfit(state, present, minutes, oldest_ns=now_ns - record_ns)
-        if errs(state, self._settings):
-            # What was compared before says nothing of an effect that has ended since.
-            for place in state.ways_back:
-                self.compared(place).forget_before(now_ns - round(state.misfit_min * 60 * NS))
         state.error.update(present)
         if sets_zero(present):
             state.zero_utc_ns, state.y_moved_ns, state.zero_channels = now_ns, 0, channels_at_zero(present)

@@ -236,11 +236,36 @@ class Comparison:
 
     def of_itself(self) -> Comparison:
         """Return what was compared since the other model has been, without the one before it."""
+        return self._since(self.state.model_ns)
+
+    def latest(self, *, deviations: float = DEVIATIONS) -> ComparisonData | None:
+        """Return the verdict on the latest hours that speak most for the other model; None while there is too little.
+
+        What was true of the hours before may have ended. Each begin is a case of its own, so together they must show
+        more.
+        """
         state = self.state
-        blocks = [block for block in state.blocks if block.number * BLOCK_NS >= state.model_ns]
-        first_ns = max(state.first_ns, state.model_ns)
-        own = msgspec.structs.replace(state, blocks=blocks, probes=state.own_probes, first_ns=first_ns)
-        return Comparison(self._period_s, own, axis=self._axis)
+        is_probed = bool(state.probes) and self._by_sensor(deviations).why is not None
+        times_ns = (
+            [one.time_utc_ns for one in state.probes] if is_probed else [one.number * BLOCK_NS for one in state.blocks]
+        )
+        begins_ns = times_ns[1 : max(len(times_ns) - FEWEST_CHANGES, 1)]
+        wanted = math.sqrt(deviations**2 + 2.0 * math.log(max(len(begins_ns), 1)))
+        found = [self._since(begin_ns).verdict(deviations=wanted) for begin_ns in begins_ns]
+        shows = [-math.inf if one.deviations is None else one.deviations for one in found]
+        return found[shows.index(max(shows))] if found else None
+
+    def _since(self, time_utc_ns: int) -> Comparison:
+        """Return what was compared since a time."""
+        state = self.state
+        blocks = [block for block in state.blocks if block.number * BLOCK_NS >= time_utc_ns]
+        probes = [probe for probe in state.probes if probe.time_utc_ns >= time_utc_ns]
+        first_ns = max(state.first_ns, time_utc_ns)
+        return Comparison(
+            self._period_s,
+            msgspec.structs.replace(state, blocks=blocks, probes=probes, first_ns=first_ns),
+            axis=self._axis,
+        )
 
     def is_itself_better(self) -> bool:
         """Return whether the other model is the better one since it has been compared, however clearly."""
