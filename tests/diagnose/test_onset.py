@@ -8,6 +8,7 @@ import pytest
 import compensator as tc
 from compensator.diagnose import diagnosis
 from compensator.diagnose.choice.onset import explains_better, onset_in
+from compensator.diagnose.fitting.prediction import FOLDS
 from compensator.diagnose.residual.change import changed_at
 from compensator.diagnose.words.summary import headline
 from compensator.model.model_file import load_model
@@ -112,10 +113,26 @@ def test_hours_count_from_the_start_of_the_data(found):
     assert later.since_h == first.since_h + 1.0
 
 
-@pytest.mark.parametrize(("part", "is_better"), [(0.5, True), (0.7, False)])
-def test_it_must_explain_itself_clearly_better(all_data, why, part, is_better):
-    later = dataclasses.replace(why.diagnosis, held_out_after=part * why.diagnosis.held_out_before)
+@pytest.mark.parametrize(("part", "is_better"), [(0.85, True), (0.95, False)])
+def test_it_must_explain_itself_better_than_the_base_and_than_all_data_explain_it(all_data, why, part, is_better):
+    before = why.diagnosis.held_out_before
+    later = dataclasses.replace(why.diagnosis, held_out_after=part * before)
     assert explains_better(later, all_data.diagnosis) is is_better
+    # What all data leave of the time before says nothing.
+    known = np.isfinite(before)
+    of_all = np.where(known, 0.6 * before, 50.0)
+    deployed = dataclasses.replace(all_data.diagnosis, model=later.model, held_out_after=of_all)
+    assert not explains_better(later, deployed)
+    assert explains_better(dataclasses.replace(later, held_out_after=0.5 * before), deployed)
+
+
+def test_a_level_of_a_block_is_no_error_of_it(all_data, why):
+    """Where all data are held out, blocks are longer, so their means are others."""
+    later = why.diagnosis
+    foretold, level = 0.5 * later.held_out_before, np.zeros(later.held_out_before.size)
+    for i, block in enumerate(later.evidence.blocks(FOLDS)):
+        level[block] = 20.0 * (-1) ** i
+    assert explains_better(dataclasses.replace(later, held_out_after=foretold + level), all_data.diagnosis)
 
 
 def test_it_must_be_deployed_and_determined(all_data, why):
@@ -124,8 +141,11 @@ def test_it_must_be_deployed_and_determined(all_data, why):
     (effect,) = later.effects
     loose = dataclasses.replace(effect.effect, std={"change": 9.0})
     assert not all(one.deployable for one in others)
-    for effects in (others, (), (dataclasses.replace(effect, effect=loose),)):  # the second: a remainder alone
+    for effects in (others, (dataclasses.replace(effect, effect=loose),)):
         assert not explains_better(dataclasses.replace(later, effects=effects), all_data.diagnosis)
+    # A remainder alone foretells as well without a name; nothing deployed foretells nothing.
+    assert explains_better(dataclasses.replace(later, effects=()), all_data.diagnosis)
+    assert not explains_better(dataclasses.replace(later, model=later.evidence.model), all_data.diagnosis)
 
 
 def test_names_in_whose_place_all_channels_are_deployed_count_as_deployed(all_data, why):

@@ -3,9 +3,9 @@
 No effect has an onset of its own, so one that began on the third day explains no whole record: a source that no channel
 shows, or another channel, takes its place. Where the base model was right until some time and errs since, and the whole
 of the record is not explained well, the search is done once more with measured Y of the time since. T_Q, AT and the
-channels of the time before still set the state. What that finds is taken if it leaves clearly less of its own held-out
-blocks, and all of it can be deployed. So is a drift of the measurement that explains everything, in the place of names
-that would be deployed: a channel that went the same way once must not be taken for it.
+channels of the time before still set the state. What that finds is taken if it leaves clearly less of the held-out
+samples since then, and all that it names can be deployed. So is a drift of the measurement in the place of names that
+would be deployed: a channel that went the same way once must not be taken for it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensator.arrays import Vector, rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.choice.deployment import SHORT_H
 from compensator.diagnose.choice.found_effect import FoundEffect
 from compensator.diagnose.choice.outcome import Diagnosis
+from compensator.diagnose.fitting.prediction import FOLDS
 from compensator.diagnose.residual.change import BLOCK_MIN, changed_at
 from compensator.model.effects.passing import Periodic
 
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
-#: The time since then must leave less than this part of what all data do.
-CLEARLY_BETTER = 0.6
+#: The time since then must leave less than this part of what all data leave of it.
+BETTER_PART = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,16 +79,36 @@ def onset_in(found: Diagnosis) -> Onset | None:
 
 
 def explains_better(later: Diagnosis, all_data: Diagnosis) -> bool:
-    """Return whether the time since an effect began explains itself clearly better than all of the data do."""
-    left = math.inf
-    if _is_of_measurement(later):
-        # A period that has come once or twice looks like anything slow.
-        is_period = any(isinstance(effect.effect, Periodic) for effect in later.effects)
-        if not is_period and any(effect.deployable for effect in all_data.effects):
-            left = _part(later, later.named.rms_um)
-    elif later.effects and all(_acts(effect) and effect.is_determined for effect in later.effects):
-        left = left_part(later)
-    return left < CLEARLY_BETTER * min(left_part(all_data), 1.0)
+    """Return whether the time since an effect began explains itself better than all of the data explain it.
+
+    By what each leaves of its samples where they were held out, about their mean in each block of that time.
+    """
+    blocks = list(later.evidence.blocks(FOLDS))
+
+    def left_um(held_out: Vector) -> float:
+        parts = [held_out[block & np.isfinite(held_out)] for block in blocks]
+        return rms_of(np.concatenate([part - np.mean(part) for part in parts if part.size]))
+
+    if later.effects and all(map(_moves_y, later.effects)):
+        if not any(effect.deployable for effect in all_data.effects):
+            return False
+        foretold = later.held_out_named
+    elif _deploys(later) and all(_acts(effect) and effect.is_determined for effect in later.effects):
+        foretold = later.held_out_after
+    else:
+        return False
+    of_all = all_data.held_out_after if _deploys(all_data) else later.held_out_before
+    return left_um(foretold) < BETTER_PART * min(left_um(of_all), left_um(later.held_out_before))
+
+
+def _deploys(found: Diagnosis) -> bool:
+    """Return whether the model is extended."""
+    return len(found.model.effects) > len(found.evidence.model.effects)
+
+
+def _moves_y(effect: FoundEffect) -> bool:
+    """Return whether measured Y moves by itself; a period that has come once or twice looks like anything slow."""
+    return effect.effect.observed and not (effect.effect.deployable or isinstance(effect.effect, Periodic))
 
 
 def _acts(effect: FoundEffect) -> bool:
@@ -103,7 +125,7 @@ def left_part(found: Diagnosis) -> float:
     """Return which part of the error on held-out data a diagnosis leaves; infinite if nothing is deployed."""
     if found.shows_nothing:
         return 0.0
-    if len(found.model.effects) == len(found.evidence.model.effects):
+    if not _deploys(found):
         return math.inf
     return _part(found, found.after.rms_um)
 
