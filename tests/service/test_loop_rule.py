@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from compensator.service.loop.run import OfflineLoop
 from compensator.service.loop.state import InShadow
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.refutation import evidence
-from compensator.service.transfer.two_models import BLOCK_NS, SURE_PART, Block, ComparisonState
+from compensator.service.transfer.two_models import BLOCK_NS, SURE_PART, Block, Comparison, ComparisonState
 from tests.service.looping import DAY, Night, decisions, extended, machine, run, settings, shown
 from tests.service.test_loop_watch import HOUR_NS, follows, watching
 from tests.service.test_restart import QUILL
@@ -50,6 +51,36 @@ def test_a_candidate_that_is_neither_better_nor_worse_is_refused_more_often_than
         alone += abs(weighed.likelihood) >= 3.0
         both += abs(weighed.likelihood) >= 3.0 and abs(weighed.deviations) >= 3.0 * SURE_PART
     assert both <= 0.7 * alone
+
+
+def compared(effect_um: np.ndarray, error_um: np.ndarray) -> Comparison:
+    """What a model leaves, and what another one does that lacks an effect, in blocks of half an hour."""
+    moves = 10.0 * np.sin(np.arange(error_um.size) / 3.0)
+    means = zip(error_um, error_um + effect_um, moves, strict=True)
+    blocks = [Block(0, n, 30, (0.0, 0.0), (float(a), float(b), float(y))) for n, (a, b, y) in enumerate(means)]
+    return Comparison(60.0, ComparisonState(blocks=blocks, first_ns=1, last_ns=error_um.size * BLOCK_NS))
+
+
+def test_where_an_effect_has_ended_the_hours_since_speak_for_the_model_before() -> None:
+    rng = np.random.default_rng(5)
+    acts = 8.0 * rng.normal(size=48)
+    acting, ended = acts.copy(), acts.copy()
+    acting[-14:], ended[:-14] = 0.0, 0.0
+    both = compared(acting - ended, 0.3 * rng.normal(size=48) + ended)
+    assert both.verdict().verdict != ComparisonVerdict.BETTER
+    latest = both.latest()
+    assert latest is not None and latest.verdict == ComparisonVerdict.BETTER and latest.hours < 9.0
+    assert compared(acts[:9], np.zeros(9)).latest() is None  # as many changes as judge a model, and none before them
+
+
+def test_a_right_model_is_hardly_ever_left_for_some_hours_that_speak_against_it() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(30):
+        noisy = compared(rng.normal(size=96), 1.2 * rng.normal(size=96))
+        for hours in range(12, 49, 4):
+            part = Comparison(60.0, msgspec.structs.replace(noisy.state, blocks=noisy.state.blocks[: 2 * hours]))
+            found = part.latest()
+            assert found is not None and found.verdict != ComparisonVerdict.BETTER
 
 
 def test_the_newest_parameters_take_the_place_and_the_comparison_goes_on() -> None:

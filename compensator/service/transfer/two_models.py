@@ -241,15 +241,17 @@ class Comparison:
     def latest(self, *, deviations: float = DEVIATIONS) -> ComparisonData | None:
         """Return the verdict on the latest hours that speak most for the other model; None while there is too little.
 
-        What was true of the hours before may have ended. Each begin is a case of its own, so together they must show
-        more.
+        What was true of the hours before may have ended. Each begin, a third earlier than the next one, is a case of
+        its own, so together they must show more.
         """
         state = self.state
         is_probed = bool(state.probes) and self._by_sensor(deviations).why is not None
-        times_ns = (
-            [one.time_utc_ns for one in state.probes] if is_probed else [one.number * BLOCK_NS for one in state.blocks]
-        )
-        begins_ns = times_ns[1 : max(len(times_ns) - FEWEST_CHANGES, 1)]
+        probes_ns = [one.time_utc_ns for one in state.probes]
+        times_ns = probes_ns if is_probed else [one.number * BLOCK_NS for one in state.blocks]
+        counts = [FEWEST_CHANGES + 1]
+        while counts[-1] < len(times_ns):
+            counts.append(math.ceil(counts[-1] * 4 / 3))
+        begins_ns = [times_ns[-count] for count in counts[:-1]]
         wanted = math.sqrt(deviations**2 + 2.0 * math.log(max(len(begins_ns), 1)))
         found = [self._since(begin_ns).verdict(deviations=wanted) for begin_ns in begins_ns]
         shows = [-math.inf if one.deviations is None else one.deviations for one in found]
