@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from compensator.arrays import rms_of
 from compensator.codes import ModelWarning
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose import diagnosis as diagnosis_module
+from compensator.diagnose.choice.deployment import Deployment
 from compensator.diagnose.choice.extended_model import with_effects
+from compensator.diagnose.choice.held_out import HeldOut
 from compensator.diagnose.choice.verdict import Judged
 from compensator.diagnose.diagnosis import DiagnosisOptions, diagnose
 from compensator.diagnose.residual.evidence import evidence_of
@@ -203,6 +206,18 @@ def test_paths_of_a_calibration_on_other_data_stay_unless_others_foretell_clearl
         assert (again.model.dtf == model.dtf) is stay
         assert reported == [(0, 4), (4, 8)]
         assert (ModelWarning.PATHS_KEPT in [one.code for one in again.warnings]) is stay
+
+
+@pytest.mark.parametrize(("alone", "named", "surpasses"), [(1.4, 1.4, True), (1.3, 1.4, False), (1.4, 1.3, False)])
+def test_new_paths_foretell_clearly_better_than_the_calibrated_ones_with_names_and_without(alone, named, surpasses):
+    def deployment(nothing: float, whole: float) -> Deployment:
+        left = dict.fromkeys(("named", "ceiling"), np.full(4, whole))
+        held_out = HeldOut(nothing=np.full(4, nothing), whole=np.full(4, whole), steps=(), **left)
+        decided = {"contradicted": False, "worse_um": None, "too_short_h": None}
+        found = SimpleNamespace(terms=(), remainder="all channels", refitted=None)
+        return Deployment(found=found, effects=(), held_out=held_out, **decided)
+
+    assert deployment(9.0, 1.0).surpasses(deployment(alone, named)) is surpasses
 
 
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(model, found, runs):

@@ -105,12 +105,13 @@ class Deployment:
         return rms_of(self.held_out.nothing if self.is_refused else self.held_out.whole)
 
     def surpasses(self, kept: Deployment) -> bool:
-        """Return whether paths fitted anew foretell held-out blocks clearly better than all that was found with `kept`.
+        """Return whether paths fitted anew foretell held-out blocks clearly better than those of the base.
 
-        A calibration on other data knows more than this record, and what is bent to the record has nothing but this to
-        show for it.
+        Than its paths alone, and than all that was found with them (`kept`). A calibration on other data knows more
+        than this record, and what is bent to the record has nothing but this to show for it.
         """
-        return not self.is_refused and self.foretold_um < LOWERS_CLEARLY * kept.foretold_um
+        kept_um = min(kept.foretold_um, rms_of(kept.held_out.nothing))
+        return not self.is_refused and self.foretold_um < LOWERS_CLEARLY * kept_um
 
 
 def deployment_of(
