@@ -126,6 +126,13 @@ def test_it_must_explain_itself_better_than_the_base_and_than_all_data_explain_i
     assert explains_better(dataclasses.replace(later, held_out_after=0.5 * before), deployed)
 
 
+def test_what_no_block_foretells_is_no_better(all_data, why):
+    nothing = np.full(why.diagnosis.held_out_before.size, np.nan)
+    assert not explains_better(dataclasses.replace(why.diagnosis, held_out_after=nothing), all_data.diagnosis)
+    unknown = dataclasses.replace(why.diagnosis, held_out_before=nothing, held_out_after=nothing)
+    assert not explains_better(unknown, all_data.diagnosis)
+
+
 def test_a_level_of_a_block_is_no_error_of_it(all_data, why):
     """Where all data are held out, blocks are longer, so their means are others."""
     later = why.diagnosis

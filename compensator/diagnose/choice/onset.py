@@ -86,8 +86,8 @@ def explains_better(later: Diagnosis, all_data: Diagnosis) -> bool:
     blocks = list(later.evidence.blocks(FOLDS))
 
     def left_um(held_out: Vector) -> float:
-        parts = [held_out[block & np.isfinite(held_out)] for block in blocks]
-        return rms_of(np.concatenate([part - np.mean(part) for part in parts if part.size]))
+        parts = [part for block in blocks if (part := held_out[block & np.isfinite(held_out)]).size]
+        return rms_of(np.concatenate([part - np.mean(part) for part in parts])) if parts else math.inf
 
     if later.effects and all(map(_moves_y, later.effects)):
         if not any(effect.deployable for effect in all_data.effects):
@@ -127,11 +127,7 @@ def left_part(found: Diagnosis) -> float:
         return 0.0
     if not _deploys(found):
         return math.inf
-    return _part(found, found.after.rms_um)
-
-
-def _part(found: Diagnosis, after_um: float) -> float:
-    before_um, floor_um = found.before.rms_um, found.noise_floor_um
+    before_um, after_um, floor_um = found.before.rms_um, found.after.rms_um, found.noise_floor_um
     if not before_um > floor_um:
         return 1.0
     return math.sqrt(max(after_um**2 - floor_um**2, 0.0) / (before_um**2 - floor_um**2))
