@@ -17,13 +17,13 @@ from compensator.arrays import rms_of
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice.advice import Advice, advice_of
-from compensator.diagnose.advice.ceiling import Ceiling, ceiling_of
+from compensator.diagnose.advice.ceiling import Ceiling
 from compensator.diagnose.advice.deciding import Deciding, PlannedTest
 from compensator.diagnose.advice.trials import Trials
 from compensator.diagnose.choice.deployment import CONTRADICTS, Deployment, deployment_of
 from compensator.diagnose.choice.extended_model import extended_model
 from compensator.diagnose.choice.found_effect import FoundEffect
-from compensator.diagnose.choice.held_out import HeldOut, held_out_of, how_held_out
+from compensator.diagnose.choice.held_out import HeldOut, ceiling_of, held_out_of, how_held_out
 from compensator.diagnose.choice.named_effects import named_effects, ranked
 from compensator.diagnose.choice.onset import explains_better, onset_in
 from compensator.diagnose.choice.outcome import Diagnosis, Refused, Remainder

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensator.diagnose.advice.ceiling import ceiling_of
 from compensator.diagnose.choice.found_effect import FoundEffect, rivals_of
+from compensator.diagnose.choice.held_out import ceiling_of
 from compensator.diagnose.choice.verdict import verdict_of
 from compensator.diagnose.words.ceiling_words import ceiling, explained
 from compensator.diagnose.words.remainder_words import remainder

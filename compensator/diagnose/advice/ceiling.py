@@ -3,14 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from compensator.arrays import rms_of
-
-if TYPE_CHECKING:
-    from compensator.diagnose.choice.held_out import HeldOut
 
 #: Named effects that explain less than this of what the channels explain fall short of it, %. It is what an engineer
 #: would act on, and no bound of statistics.
@@ -49,15 +41,3 @@ class Ceiling:
     def least_um(self) -> float:
         """The smallest residual of all that was tried, µm."""
         return self.rms_um if self.least_rms_um is None else self.least_rms_um
-
-
-def ceiling_of(held_out: HeldOut) -> Ceiling | None:
-    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
-    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
-    if linear >= before:
-        return None
-    return Ceiling(
-        rms_um=float(np.sqrt(linear)),
-        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
-        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
-    )

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from compensator.arrays import Indices, Vector, rms_of
+from compensator.diagnose.advice.ceiling import Ceiling
 from compensator.diagnose.choice.outcome import Step
 from compensator.diagnose.fitting.likelihood import rest_without_effects
 from compensator.diagnose.fitting.points import Points, SlowRest
@@ -180,6 +181,18 @@ def _completed(
     predicted = {name: beside(one) for name, one in added.items()}
     predicted |= {rest: completed(paths) for rest, completed in zip(_RESTS, (alone, beside), strict=True)}
     return _Predictions(predicted=predicted, knows_zero=zeros_known(points), has=has)
+
+
+def ceiling_of(held_out: HeldOut) -> Ceiling | None:
+    """Return what all channels could explain, how much of that the named effects do, and the smallest error of all."""
+    before, after, linear = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
+    if linear >= before:
+        return None
+    return Ceiling(
+        rms_um=float(np.sqrt(linear)),
+        explained_pct=float(np.clip((before - after) / (before - linear), 0, 1)) * 100,
+        least_rms_um=float(np.sqrt(min(linear, after, rms_of(held_out.whole) ** 2))),
+    )
 
 
 def how_held_out(evidence: Evidence, beside: Sequence[str] = ()) -> str:
