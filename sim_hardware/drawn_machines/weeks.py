@@ -348,4 +348,5 @@ SEALED_WEEK_RUNS: tuple[tuple[tuple[int, ...], str], ...] = (
         ),
         "2026-11-28, what has ended is left out; tests/bench/README.md, The loop",
     ),
+    ((880_005, 880_030, 880_055, 880_080), "2026-11-29, levels at a warm zero; tests/bench/README.md, The loop"),
 )
