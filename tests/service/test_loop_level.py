@@ -225,7 +225,8 @@ def test_the_way_back_keeps_the_level_of_its_zero_unless_the_present_one_is_clea
     [
         (10.0, 12.0, 12.0, 12.0),
         (10.0, 1.0, 12.0, 0.0),
-        (10.0, 3.0, 4.0, 4.0),  # both are better: the nearer one
+        (10.0, 3.0, 4.0, 4.0),  # both are better: the one that is nearer by far
+        (10.0, 3.0, 4.9, 0.0),  # nearer by little
         (10.0, 21.0, 12.0, None),  # neither is
     ],
 )
@@ -236,6 +237,11 @@ def test_the_level_of_newer_parameters_is_their_own_or_that_of_the_present_ones(
     place = InShadow(sha256="b" * 64, effects=[], role="candidate", since_utc_ns=1, verdict=verdict)
     place.comparison, place.kept_level_um = ComparisonState(blocks=blocks), kept_um
     assert Compared(place, settings().loop, 60.0, ErrorBlocks(), same=True).level_um == level_um
+    place.comparison = ComparisonState()  # of probes, by which both models are corrected
+    probed = msgspec.structs.replace(verdict, measured_by="probe", candidate_rms_um=0.9 * own_um)
+    place.verdict, at_zero = probed, Compared(place, settings().loop, 60.0, ErrorBlocks(), same=True)
+    assert at_zero.level_um == at_zero.level_at_return_um == 0.0
+    place.verdict = verdict
     place.comparison = ComparisonState(blocks=blocks[:7])  # less than four hours do not show that of the present ones
     assert Compared(place, settings().loop, 60.0, ErrorBlocks(), same=True).level_um == (None if level_um else level_um)
 

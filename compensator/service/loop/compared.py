@@ -271,13 +271,14 @@ class Compared:
 
     @property
     def _own_level_um(self) -> float:
-        """The level at which the other model counts from the last zero, µm: the one that is nearer to measured Y.
+        """The level at which the other model counts from the last zero, µm.
 
         What acted at a zero on a warm machine is in measured Y there, and what the model predicts then is subtracted,
-        which is no level. What began later is not: then what the present model predicts there is subtracted.
+        which is no level. What began later is not: where that is nearer to measured Y by far, what the present model
+        predicts there is subtracted. By little it is nearer by chance, for each model has an error of its own there.
         """
         kept_um = self._place.kept_level_um
-        return kept_um if self._left_um(kept_um) < self._left_um(0.0) else 0.0
+        return kept_um if self._left_um(kept_um) < OWN_PART * self._left_um(0.0) else 0.0
 
     def _left_um(self, level_um: float) -> float:
         """Return what the other model leaves about the last zero if it is raised by so much, as the root of a sum."""
