@@ -15,8 +15,8 @@ LEVEL_PART = 0.8
 #: One that adds nothing at rest, about a zero at rest, must be no more wrong about it than the present one; where
 #: measured Y has moved by itself, which may hide the error of either, than so many times as much.
 MOVED_PART = 2.0
-#: Of what it leaves about that zero less than this part of what the present model does is its own misfit; and a level of
-#: the present model is nearer than its own by far.
+#: Of what it leaves about that zero less than this part of what the present model does is its own misfit. The level of
+#: the present model is nearer than its own by far if it leaves less than this part.
 OWN_PART = 0.5
 #: What diagnoses have found runs in so many places at once. The diagnoses of simulated weeks name two or three
 #: explanations by turns; each costs processor time, and what the others must show (`shared`).
