@@ -182,11 +182,9 @@ class Compared:
     @property
     def _is_alone_near_zero(self) -> bool:
         """Whether only the other model is right about the zero, and its changes are no worse."""
-        residuals_um, found = self._comparison.residuals_um, self._place.verdict
-        if len(residuals_um) < FEWEST_CHANGES or (found.deviations is not None and found.deviations < 0.0):
-            return False
-        left_um = self._left_um(self._own_level_um)
-        return 0.0 < left_um <= ALONE_PART * math.hypot(*(own for _, own, _ in residuals_um))
+        shown, own_um = self._place.verdict.deviations, self._own_level_um
+        is_no_worse = shown is None or shown >= 0.0
+        return is_no_worse and self._left_um(own_um) > 0.0 and self._is_better_at(own_um, ALONE_PART)
 
     @property
     def _is_itself_better(self) -> bool:

@@ -245,7 +245,7 @@ class Comparison:
         its own, so together they must show more.
         """
         state = self.state
-        is_probed = bool(state.probes) and self._by_sensor(deviations).why is not None
+        is_probed = self.verdict(deviations=deviations).measured_by == "probe"
         probes_ns = [one.time_utc_ns for one in state.probes]
         times_ns = probes_ns if is_probed else [one.number * BLOCK_NS for one in state.blocks]
         counts = [FEWEST_CHANGES + 1]
