@@ -108,7 +108,7 @@ def _deploys(found: Diagnosis) -> bool:
 
 def _moves_y(effect: FoundEffect) -> bool:
     """Return whether measured Y moves by itself; a period that has come once or twice looks like anything slow."""
-    return effect.effect.observed and not (effect.effect.deployable or isinstance(effect.effect, Periodic))
+    return effect.effect.of_measurement and not isinstance(effect.effect, Periodic)
 
 
 def _acts(effect: FoundEffect) -> bool:

@@ -119,7 +119,7 @@ class Findings:
     @property
     def is_of_measurement(self) -> bool:
         """Whether all that is named depends on time alone, and is an error of the measurement."""
-        return bool(self.terms) and all(one.effect.observed and not one.effect.deployable for one in self.terms)
+        return bool(self.terms) and all(one.effect.of_measurement for one in self.terms)
 
     @property
     def corrects_late_t_q(self) -> bool:

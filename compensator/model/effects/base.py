@@ -176,6 +176,11 @@ class Effect:
     explanation: str = ""
 
     @property
+    def of_measurement(self) -> bool:
+        """Whether it is an error of the measurement: it depends on time alone, and no model can have it."""
+        return self.observed and not self.deployable
+
+    @property
     def off_at_zero(self) -> tuple[str, ...] | None:
         """Channels at whose 0 the effect adds nothing on a machine at rest; None where it may.
 
